@@ -1,0 +1,82 @@
+# `make train` and `make pytest` set everything up in .venv first. Both can be repeated: what is done already is skipped.
+#
+#   PYTHON=python3.11   the interpreter that .venv is made from (default: the first of 3.10 to 3.12 that is found)
+#   ENV=active          use the environment that is active instead of .venv, and install nothing
+#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest
+#   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+VENV := .venv
+EXTRAS := run,maniskill,contrib,tests,dev
+CODE := sb3_cpm tests setup.py
+
+ifeq ($(ENV),active)
+BIN :=
+READY :=
+RENDERING :=
+else
+BIN := $(VENV)/bin/
+READY := $(VENV)/.installed
+RENDERING := $(VENV)/.rendering
+endif
+RUN := $(BIN)python -m
+
+# Threads that wait by spinning cost more than they bring at these sizes.
+export OMP_NUM_THREADS ?= 1
+
+help:
+	@echo "make train           set up, train CPM-SAC on PickCube-v1, leave a folder of results in runs/"
+	@echo "make pytest          set up, run all tests"
+	@echo "make doctor          what works here and what is missing"
+	@echo "make type lint format check-codestyle commit-checks"
+	@echo "make venv, make clean-venv"
+
+train: $(READY) $(RENDERING)
+	$(RUN) sb3_cpm train $(ARGS)
+
+pytest: $(READY) $(RENDERING)
+	$(RUN) pytest $(ARGS)
+
+doctor: $(READY)
+	$(RUN) sb3_cpm doctor
+
+venv: $(READY)
+
+rendering: $(READY) $(RENDERING)
+
+$(VENV)/bin/python:
+	@echo "==> Making a virtual environment in $(VENV)"
+	@python="$$(scripts/find_python.sh "$(PYTHON)")" && "$$python" --version && "$$python" -m venv $(VENV)
+
+$(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
+	@echo "==> Installing sb3_cpm[$(EXTRAS)] with the versions of constraints.txt (about 3 minutes)"
+	@$(BIN)python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[$(EXTRAS)]"
+	@touch $@
+
+$(VENV)/.rendering: $(VENV)/.installed
+	@echo "==> Looking for a Vulkan device that can render"
+	@$(RUN) sb3_cpm setup-rendering
+	@touch $@
+
+type: $(READY)
+	$(RUN) mypy
+
+lint: $(READY)
+	$(BIN)ruff check $(CODE)
+	$(BIN)lint-imports
+
+format: $(READY)
+	$(BIN)ruff check --select I --fix $(CODE)
+	$(BIN)ruff format $(CODE)
+
+check-codestyle: $(READY)
+	$(BIN)ruff check --select I $(CODE)
+	$(BIN)ruff format --check --diff $(CODE)
+
+commit-checks: format type lint
+
+clean-venv:
+	rm -rf $(VENV)
+
+.PHONY: help train pytest doctor venv rendering type lint format check-codestyle commit-checks clean-venv
