@@ -1,0 +1,8 @@
+"""
+Environments. The only place that imports ManiSkill or SAPIEN, and only when an environment is made: importing
+``sb3_cpm.envs`` works without them.
+"""
+
+from sb3_cpm.envs.maniskill import ManiSkillEnv, make_maniskill_env
+
+__all__ = ["ManiSkillEnv", "make_maniskill_env"]

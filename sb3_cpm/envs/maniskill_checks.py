@@ -1,0 +1,175 @@
+"""What can be wrong with a request for a ManiSkill task, found out before anything is built, and said with the cure."""
+
+import contextlib
+import difflib
+import inspect
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+DEFAULT_ROBOT = "panda_wristcam"
+"""The Panda with a camera at its hand, the report's robot."""
+
+ASSET_FILES = {"ycb": "info_pick_v0.json"}
+"""A file that a complete download has: ManiSkill itself only asks for the folder, which a failed download leaves behind."""
+
+
+class Task(NamedTuple):
+    """
+    A task that can be built.
+
+    :param robot: ManiSkill's name of the robot, None if the task chooses one that we cannot know
+    :param robot_kwargs: what to tell the task about its robot
+    :param max_episode_steps: steps until truncation
+    """
+
+    robot: str | None
+    robot_kwargs: dict[str, Any]
+    max_episode_steps: int
+
+
+def check_sizes(
+    image_size: int | tuple[int, int],
+    n_points: int,
+    goal_points: int,
+    max_distance: float,
+    max_episode_steps: int | None,
+    render_size: int,
+) -> tuple[int, int]:
+    """
+    :return: height and width of the images
+    :raises ValueError: if a number is of no use
+    """
+    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+    if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+        raise ValueError(f"image_size must be a positive number of pixels or (height, width), got {image_size!r}.")
+    if max_episode_steps is not None and max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps must be at least 1 or None for the task's own, got {max_episode_steps!r}.")
+    if not max_distance > 0:
+        raise ValueError(f"max_distance must be a positive number of metres, got {max_distance!r}.")
+    if not (isinstance(render_size, int) and render_size > 0):
+        raise ValueError(f"render_size must be a positive number of pixels, got {render_size!r}.")
+    for name, value in (("n_points", n_points), ("goal_points", goal_points)):
+        if not isinstance(value, int) or value < 0:
+            raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
+    return size[0], size[1]
+
+
+def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: str, max_episode_steps: int | None) -> Task:
+    """
+    :param env_id: name of the task
+    :param robot: name of the robot or None for :data:`DEFAULT_ROBOT` where possible
+    :param control_mode: name of the controller
+    :param reward_mode: kind of reward
+    :param max_episode_steps: None for the task's own
+    :raises ValueError: if the task, robot, controller or reward does not exist, naming those that do
+    :raises RuntimeError: if files that the task needs are missing, with the command that downloads them
+    """
+    from mani_skill.agents.registration import REGISTERED_AGENTS
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    if env_id not in REGISTERED_ENVS:
+        raise ValueError(f"Unknown task {env_id!r}. {_nearest(env_id, REGISTERED_ENVS)}")
+    spec = REGISTERED_ENVS[env_id]
+    if robot is not None and robot not in REGISTERED_AGENTS:
+        raise ValueError(f"Unknown robot {robot!r}. {_nearest(robot, REGISTERED_AGENTS)}")
+    modes = spec.cls.SUPPORTED_REWARD_MODES
+    if reward_mode not in modes:
+        raise ValueError(f"{env_id} has no reward_mode {reward_mode!r}, it has: {', '.join(modes)}.")
+    steps = max_episode_steps or spec.max_episode_steps
+    if steps is None:
+        raise ValueError(f"{env_id} has no time limit of its own: pass max_episode_steps=...")
+    _check_assets(env_id, spec.asset_download_ids or ())
+
+    known = {name for robots in spec.cls.SUPPORTED_ROBOTS or () for name in ([robots] if isinstance(robots, str) else robots)}
+    if robot is None and known & {"panda", DEFAULT_ROBOT}:
+        robot = DEFAULT_ROBOT
+    task = Task(robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
+    if task.robot in REGISTERED_AGENTS:
+        _check_robot(REGISTERED_AGENTS[task.robot].agent_cls, control_mode)
+    return task
+
+
+@contextlib.contextmanager
+def explained(env_id: str) -> Iterator[None]:
+    """
+    Around the building of a task: whatever ManiSkill says about missing files becomes an error with the cure, and its warning
+    that the robot with the hand camera is not in the task's list (it is the listed Panda with a camera) stays away.
+    """
+    from mani_skill import logger
+
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    except (FileNotFoundError, EOFError, SystemExit) as error:
+        raise _missing_assets(env_id, str(error)) from error
+    except RuntimeError as error:
+        if "ownload" not in str(error):
+            raise
+        raise _missing_assets(env_id, str(error)) from error
+    finally:
+        logger.setLevel(level)
+
+
+def _check_assets(env_id: str, asset_ids: Any) -> None:
+    """Like ManiSkill's own check, which however asks on stdin: a prompt that hangs a batch job for ever."""
+    from mani_skill.utils import assets
+
+    missing = []
+    for asset_id in asset_ids:
+        group = asset_id in assets.DATA_GROUPS
+        for source_id in assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else (asset_id,):
+            source = assets.DATA_SOURCES[source_id]
+            folder = Path(source.output_dir) / source.target_path
+            if not folder.exists() or not (folder / ASSET_FILES.get(source_id, "")).exists():
+                missing.append(source_id)
+            elif folder.is_dir() and not any(folder.iterdir()):
+                missing.append(source_id)
+    if missing:
+        names = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        raise _missing_assets(env_id, names)
+
+
+def _missing_assets(env_id: str, what: str) -> RuntimeError:
+    from mani_skill import ASSET_DIR
+
+    return RuntimeError(
+        f"{env_id} needs files that are not here or not complete: {what}. They belong into {ASSET_DIR} (the environment variable "
+        f"MS_ASSET_DIR moves that). Download them, after removing incomplete folders, with:\n"
+        f"    python -m mani_skill.utils.download_asset {env_id}"
+    )
+
+
+def _check_robot(agent_class: Any, control_mode: str) -> None:
+    from mani_skill import format_path
+
+    path = agent_class.urdf_path or agent_class.mjcf_path
+    if isinstance(path, str) and not os.path.exists(format_path(path)):
+        raise RuntimeError(
+            f"The files of robot {agent_class.uid!r} are missing: {format_path(path)}. Download them with:\n"
+            f"    python -m mani_skill.utils.download_asset {agent_class.uid}"
+        )
+    try:
+        # the table of controllers needs only class attributes for nearly all robots; where it needs a simulated robot,
+        # ManiSkill will complain itself
+        controllers = list(agent_class._controller_configs.fget(object.__new__(agent_class)))
+    except Exception:
+        return
+    if control_mode not in controllers:
+        raise ValueError(
+            f"Robot {agent_class.uid!r} has no controller {control_mode!r}. {_nearest(control_mode, controllers)} "
+            f"All: {', '.join(controllers)}."
+        )
+
+
+def _own_robot(task_class: Any) -> str | None:
+    parameter = inspect.signature(task_class.__init__).parameters.get("robot_uids")
+    return parameter.default if parameter is not None and isinstance(parameter.default, str) else None
+
+
+def _nearest(name: str, names: Any) -> str:
+    near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.4)
+    return f"Did you mean {' or '.join(near)}?" if near else f"There are: {', '.join(sorted(names))}."
