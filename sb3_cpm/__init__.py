@@ -1,0 +1,27 @@
+"""
+CPM for Stable-Baselines3: a challenger explores beside the player and turns what it finds into challenges.
+
+Algorithm 1 of the report, with the place where each line lives::
+
+    for all rounds:                                                       callbacks.ChallengerCallback
+        generate a trajectory with P and, epsilon-greedily, C             exploration
+        store it in D                                                     buffers.CPMBuffer
+        for all its transitions, C estimates
+            the epistemic uncertainty u                                   challenger, uncertainty
+            the embedding e                                               challenger, world_model
+            the score S(r, u)                                             challenges.quality
+        the best one is the goal; cut the trajectory there                challenges.curator
+        keep it if the filter F does                                      challenges.filters
+        replace its rewards by R(r, u, progress toward the goal)          challenges.rewards
+            with all coefficients following their targets                 challenges.targeting
+        store it in I                                                     buffers.CPMBuffer
+        train world model, encoder and C on D                             challenger, world_model
+        train P on D and I                                                Stable-Baselines3
+"""
+
+from pathlib import Path
+
+
+__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
+
+__all__ = ["__version__"]

@@ -1,0 +1,383 @@
+"""
+The conductor: drives the challenger during ``model.learn()`` (Algorithm 1 of the report).
+
+Everything goes through SB3's own seams: a callback, a replay buffer class, and a VecEnv wrapper that is around the
+model's environment for the time of ``learn()``.
+"""
+
+import signal
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_cpm.buffers import CPMBuffer, Episode
+from sb3_cpm.challenger import Challenger
+from sb3_cpm.challenges import CRITERIA, Proposal
+from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
+from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.uncertainty.base import Uncertainty
+
+
+class ChallengerCallback(BaseCallback):
+    """
+    Lets a challenger explore beside an off-policy SB3 agent and propose challenges to its :class:`CPMBuffer`.
+
+    ::
+
+        model = SAC("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)
+        model.learn(100_000, callback=ChallengerCallback())
+
+    After ``learn()`` the callback still holds the trained challenger; using the callback for a second ``learn()`` goes on
+    with it. Logged under ``challenger/`` (losses), ``challenge/`` (coefficients, tolerances, acceptance) and
+    ``rollout/exploration_rate``.
+
+    :param preset: sizes and learning rates of the challenger, the name of one of :data:`sb3_cpm.presets.PRESETS` or a dict
+    :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds
+    :param uncertainty_class: estimator of epistemic uncertainty, a name or a class
+    :param uncertainty_kwargs: its arguments
+    :param challenger_kwargs: entries of the preset to override
+    :param decay: decay model of the exploration probability epsilon, a name or a function of the remaining progress,
+        see :func:`~sb3_cpm.exploration.make_decay`
+    :param decay_kwargs: its start, floor and rate
+    :param unit: whether P or C acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
+    :param segment_length: number of steps in a segment
+    :param train_freq: number of environment steps (over all environments) between the challenger's updates
+    :param gradient_steps: number of its updates then
+    :param load_path: a challenger saved by :meth:`save` to start from
+    :param device: PyTorch device of the challenger; "auto": the model's
+    :param verbose: 1 for messages
+    :raises ValueError: in ``learn()``, before any training, for models that this cannot work with
+    """
+
+    def __init__(
+        self,
+        preset: str | dict[str, Any] = "default",
+        keys: Sequence[str] | None = None,
+        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_kwargs: dict[str, Any] | None = None,
+        challenger_kwargs: dict[str, Any] | None = None,
+        decay: str | Schedule = "exponential",
+        decay_kwargs: dict[str, Any] | None = None,
+        unit: ExplorationUnit = "step",
+        segment_length: int = 10,
+        train_freq: int = 25,
+        gradient_steps: int = 1,
+        load_path: str | Path | None = None,
+        device: th.device | str = "auto",
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if train_freq < 1 or gradient_steps < 0:
+            raise ValueError(f"train_freq must be at least 1 and gradient_steps at least 0, got {train_freq} and {gradient_steps}")
+        if unit not in ("step", "segment", "episode"):
+            raise ValueError(f'unit must be "step", "segment" or "episode", got {unit!r}')
+        if segment_length < 1:
+            raise ValueError(f"segment_length must be at least 1, got {segment_length}")
+        self.preset = preset
+        self.keys = keys
+        self.uncertainty_class = uncertainty_class
+        self.uncertainty_kwargs = uncertainty_kwargs
+        self.challenger_kwargs = challenger_kwargs or {}
+        self.decay = make_decay(decay, **(decay_kwargs or {}))
+        self.unit = unit
+        self.segment_length = segment_length
+        self.train_freq = train_freq
+        self.gradient_steps = gradient_steps
+        self.load_path = load_path
+        self.device = device
+
+        #: Made in the first ``learn()``, from the model's spaces.
+        self.challenger: Challenger | None = None
+        #: What was proposed from the episodes of the rollout that ended last.
+        self.proposals: list[tuple[Episode, Proposal]] = []
+        self.stopwatch = Stopwatch()
+        self._env: ExplorationVecEnv | None = None
+        self._previous_sigint: Any = None
+        self._last_training = 0
+
+    # ------------------------------------------------------------------ public
+
+    @property
+    def epsilon(self) -> float:
+        """Probability that C, not P, acts now."""
+        return float(self.decay(self.model._current_progress_remaining))
+
+    @property
+    def buffer(self) -> CPMBuffer:
+        """D and I of the model."""
+        assert isinstance(self.model.replay_buffer, CPMBuffer)  # type: ignore[attr-defined]
+        return self.model.replay_buffer  # type: ignore[attr-defined]
+
+    @property
+    def explored_share(self) -> float:
+        """Share of the actions of this ``learn()`` that C gave; nan before the first."""
+        if self._env is None or self._env.n_actions == 0:
+            return float("nan")
+        return self._env.n_explored / self._env.n_actions
+
+    def save(self, path: str | Path) -> None:
+        """
+        Save the challenger, with optimizers and scales, for ``ChallengerCallback(load_path=...)``.
+
+        :param path: file to write, replaced only once it is complete
+        :raises RuntimeError: before the first ``learn()``
+        """
+        if self.challenger is None:
+            raise RuntimeError("There is no challenger to save yet: it is made when learn() starts")
+        self.challenger.save(path)
+
+    # ------------------------------------------------------------------ SB3's hooks
+
+    def _init_callback(self) -> None:
+        model = self.model
+        _check_model(model)
+        _check_learning_starts(model)  # type: ignore[arg-type]
+        if self.challenger is None:
+            self.challenger = self._make_challenger()
+        elif (self.challenger.observation_space, self.challenger.action_space) != (model.observation_space, model.action_space):
+            raise ValueError(
+                "This callback's challenger belongs to other spaces than the model's: observations "
+                f"{self.challenger.observation_space} against {model.observation_space}, actions {self.challenger.action_space} "
+                f"against {model.action_space}. Make a new ChallengerCallback."
+            )
+
+    def _make_challenger(self) -> Challenger:
+        assert isinstance(self.model.observation_space, spaces.Dict) and isinstance(self.model.action_space, spaces.Box)
+        challenger = Challenger(
+            self.model.observation_space,
+            self.model.action_space,
+            device=self.model.device if self.device == "auto" else self.device,
+            preset=self.preset,
+            keys=self.keys,
+            uncertainty_class=self.uncertainty_class,
+            uncertainty_kwargs=self.uncertainty_kwargs,
+            **self.challenger_kwargs,
+        )
+        if self.load_path is not None:
+            challenger.load_state(self.load_path)
+        return challenger
+
+    def _on_training_start(self) -> None:
+        model = self.model
+        assert self.challenger is not None and isinstance(model, OffPolicyAlgorithm)
+        self._detach()
+        if self.buffer.player_keys is None:
+            self.buffer.player_keys = _player_keys(model)
+        last_obs = model._last_obs if model._vec_normalize_env is None else model._last_original_obs
+        self._env = ExplorationVecEnv(
+            without_exploration(model.env),
+            self.challenger,
+            lambda: self.epsilon,
+            last_obs,  # type: ignore[arg-type]
+            self.unit,
+            self.segment_length,
+            self.stopwatch,
+            on_failure=self._detach,
+        )
+        model.env = self._env
+        self.buffer.has_challenger = True
+        self.buffer.stopwatch = self.stopwatch
+        self._last_training = model.num_timesteps
+        self._listen_for_ctrl_c()
+
+    def _on_rollout_start(self) -> None:
+        self.stopwatch.stop("P trains")
+        self.stopwatch.start("P acts")
+        if self._env is not None:
+            self._env.active = True
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.stopwatch.stop("P acts")
+        try:
+            self._propose_challenges()
+            self._train_challenger()
+        except BaseException:
+            self._detach()
+            raise
+        self.logger.record("rollout/exploration_rate", self.epsilon)
+        if self._env is not None:
+            self._env.active = False
+        self.stopwatch.start("P trains")
+
+    def _on_training_end(self) -> None:
+        self._detach()
+
+    # ------------------------------------------------------------------ Algorithm 1
+
+    def _propose_challenges(self) -> None:
+        """Lines 4 to 19: rate every state of the new trajectories, choose, filter, cut and relabel."""
+        assert self.challenger is not None
+        self.proposals = []
+        for episode in self.buffer.pop_completed():
+            with self.stopwatch.section("bookkeeping"):
+                if self.challenger.trained_updates == 0:
+                    self.buffer.remember_reward(episode)  # what an untrained model says about novelty is noise
+                    continue
+                observations = self.buffer.episode_observations(episode, self.challenger.keys)
+                actions = self.buffer.episode_actions(episode)
+            with self.stopwatch.section("C evaluates"):
+                evaluation = self.challenger.evaluate(observations, actions)
+            with self.stopwatch.section("bookkeeping"):
+                proposal = self.buffer.propose(episode, evaluation)
+                if proposal is not None:
+                    self.proposals.append((episode, proposal))
+                    self._log_proposal(proposal)
+
+    def _train_challenger(self) -> None:
+        """Line 21: train world model, ensemble, and C's actor and critic on D."""
+        assert self.challenger is not None and isinstance(self.model, OffPolicyAlgorithm)
+        due = self.model.num_timesteps - self._last_training >= self.train_freq
+        if not (due and self.model.num_timesteps > self.model.learning_starts and self.buffer.episodes_ended):
+            return
+        self._last_training = self.model.num_timesteps
+        for _ in range(self.gradient_steps):
+            with self.stopwatch.section("buffer"):
+                batch = self.buffer.sample_sequences(
+                    self.challenger.batch_size, self.challenger.sequence_length, self.challenger.keys
+                )
+            with self.stopwatch.section("C trains"):
+                metrics = self.challenger.train(batch)
+            for name, value in metrics.items():
+                self.logger.record_mean(f"challenger/{name}", value)
+            self.logger.record("challenger/n_updates", self.challenger.trained_updates, exclude="tensorboard")
+
+    def _log_proposal(self, proposal: Proposal) -> None:
+        for name, value in proposal.coefficients.items():
+            self.logger.record(f"challenge/{name}", value)
+        counters = self.buffer.counters
+        self.logger.record("challenge/proposed", counters.proposed)
+        self.logger.record("challenge/kept", counters.kept)
+        self.logger.record("challenge/in_buffer", len(self.buffer.challenges))
+        for criterion in CRITERIA:
+            self.logger.record(f"challenge/acceptance_{criterion}", 1 - counters.rejected_by[criterion] / counters.proposed)
+        self.logger.record_mean("challenge/uncertainty", proposal.uncertainty[proposal.first :].mean())
+        self.logger.record_mean("challenge/score_goal", proposal.score[proposal.goal])
+        if proposal.artificial is not None:
+            self.logger.record_mean("challenge/length", len(proposal.artificial.total))
+            self.logger.record_mean("challenge/reward", proposal.artificial.total.mean())
+            for term in ("extrinsic", "exploration", "embedding", "step"):
+                self.logger.record_mean(f"challenge/reward_{term}", getattr(proposal.artificial, term).mean())
+
+    # ------------------------------------------------------------------ coming and going
+
+    def _detach(self) -> None:
+        """Take the wrapper off the model's environment. Harmless when it is not there."""
+        for section in ("P trains", "P acts"):
+            self.stopwatch.stop(section)
+        if self._env is not None:
+            self._env.active = False
+        self.model.env = without_exploration(self.model.env)
+        buffer = self.model.replay_buffer  # type: ignore[attr-defined]
+        if isinstance(buffer, CPMBuffer):
+            buffer.has_challenger = False
+            buffer.stopwatch = None
+        if self._previous_sigint is not None:
+            signal.signal(signal.SIGINT, self._previous_sigint)
+            self._previous_sigint = None
+
+    def _listen_for_ctrl_c(self) -> None:
+        """Ctrl-C can come while P trains, where no hook of ours would see the exception."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        previous = signal.getsignal(signal.SIGINT)
+        if not callable(previous):
+            return
+
+        def handler(signum: int, frame: FrameType | None) -> None:
+            self._detach()
+            previous(signum, frame)
+
+        signal.signal(signal.SIGINT, handler)
+        self._previous_sigint = previous
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A callback is not part of a saved model, but checkpointing tools may pickle what refers to it."""
+        state = self.__dict__.copy()
+        state.update(_env=None, _previous_sigint=None)
+        return state
+
+
+def without_exploration(env: VecEnv | None) -> VecEnv:
+    """:return: the environment without any exploration wrapper around it, one that an exception left behind included"""
+    assert env is not None
+    while isinstance(env, ExplorationVecEnv):
+        env = env.venv
+    inner = env
+    while isinstance(inner, VecEnvWrapper):
+        if isinstance(inner.venv, ExplorationVecEnv):
+            inner.venv = inner.venv.venv
+        else:
+            inner = inner.venv
+    return env
+
+
+def _player_keys(model: OffPolicyAlgorithm) -> tuple[str, ...] | None:
+    """Keys that P's features extractors read, where they tell; images that only C looks at need not be moved for P."""
+    extractors = [
+        module.features_extractor
+        for module in (model.policy, getattr(model, "actor", None), getattr(model, "critic", None))
+        if getattr(module, "features_extractor", None) is not None
+    ]
+    keys = [getattr(extractor, "player_keys", None) for extractor in extractors]
+    if not keys or any(read is None for read in keys):
+        return None
+    wanted = set().union(*keys)  # type: ignore[arg-type]
+    return tuple(key for key in model.observation_space.spaces if key in wanted)  # type: ignore[attr-defined]
+
+
+def _check_model(model: Any) -> None:
+    """Everything that must hold before the first step is taken."""
+    name = type(model).__name__
+    if not isinstance(model, OffPolicyAlgorithm):
+        raise ValueError(f"ChallengerCallback needs an off-policy algorithm with a CPMBuffer (SAC, TD3, DDPG, TQC), got {name}")
+    if not isinstance(model.observation_space, spaces.Dict):
+        raise ValueError(
+            f"ChallengerCallback needs a Dict observation space, got {model.observation_space}. Wrap the environment in "
+            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...); CrossQ has no such policy, SAC, TD3, DDPG '
+            "and TQC do."
+        )
+    if not isinstance(model.action_space, spaces.Box):
+        raise ValueError(f"ChallengerCallback needs continuous actions (a Box action space), got {model.action_space}")
+    if not isinstance(model.replay_buffer, CPMBuffer):
+        raise ValueError(
+            f"ChallengerCallback needs a CPMBuffer, but {name} has a {type(model.replay_buffer).__name__}: make it with "
+            f'{name}("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)'
+        )
+
+
+def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
+    """P can only sample once an episode has ended; say so now instead of in the middle of the run."""
+    assert model.env is not None
+    if not model.replay_buffer.episodes_ended and (longest := _max_episode_steps(model.env)) is not None:  # type: ignore[union-attr]
+        needed = longest * model.n_envs
+        if model.learning_starts < needed and model.buffer_size >= needed:
+            raise ValueError(
+                f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps in "
+                f"each of {model.n_envs} environments. Set learning_starts={needed} or more."
+            )
+        if model.buffer_size < needed:
+            raise ValueError(
+                f"buffer_size={model.buffer_size} is too small for one episode of {longest} steps in each of {model.n_envs} "
+                f"environments. Set buffer_size={needed} or more."
+            )
+
+
+def _max_episode_steps(env: VecEnv) -> int | None:
+    try:
+        specs = env.get_attr("spec")
+    except AttributeError:  # VecEnvs that are not made of gymnasium environments
+        return None
+    limits = [spec.max_episode_steps for spec in specs if spec is not None and spec.max_episode_steps is not None]
+    return max(limits) if limits else None

@@ -1,0 +1,28 @@
+"""
+Challenge choice in NumPy: one module per step of the method (report, section 4.4).
+
+===================  =======================================================
+``targeting``        dynamic hyperparameter targeting (Algorithm 2)
+``quality``          challenge quality score S
+``filters``          filter F with self-balancing strictness, reward memory
+``rewards``          artificial reward R
+``curator``          the four of them applied to a trajectory in turn
+===================  =======================================================
+"""
+
+from sb3_cpm.challenges.curator import ChallengeCurator, Proposal
+from sb3_cpm.challenges.filters import CRITERIA, ChallengeFilter
+from sb3_cpm.challenges.quality import ChallengeQuality
+from sb3_cpm.challenges.rewards import ArtificialReward, ArtificialRewards
+from sb3_cpm.challenges.targeting import DynamicCoefficient
+
+__all__ = [
+    "CRITERIA",
+    "ArtificialReward",
+    "ArtificialRewards",
+    "ChallengeCurator",
+    "ChallengeFilter",
+    "ChallengeQuality",
+    "DynamicCoefficient",
+    "Proposal",
+]

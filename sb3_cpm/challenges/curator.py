@@ -1,0 +1,162 @@
+"""
+The challenge curator: from a finished trajectory and the challenger's evaluation of it to a challenge, or none.
+
+Lines 9 to 18 of Algorithm 1 in the report: score every transition, choose the goal, filter, relabel. All state that
+this needs (six coefficients, three tolerances, the reward memory) is here, in plain numbers, and is pickled with the buffer.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_cpm.challenges.filters import CandidateStatistics, ChallengeFilter
+from sb3_cpm.challenges.quality import ChallengeQuality, best_goal
+from sb3_cpm.challenges.rewards import ArtificialReward, ArtificialRewards
+from sb3_cpm.type_aliases import Evaluation
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """
+    What the curator thought of one trajectory of ``n_steps`` transitions.
+
+    :param rewards: task reward r, shape ``(n_steps,)``
+    :param uncertainty: u, shape ``(n_steps,)``
+    :param score: S, shape ``(n_steps,)``
+    :param disagreement: DISAG, shape ``(n_steps,)``
+    :param kl: KL, shape ``(n_steps,)``
+    :param first: index of the first counted transition
+    :param goal: index g of the goal transition; the goal is the state s_{g+1}
+    :param verdicts: for each criterion F1 to F5 by name, whether it would keep the candidate
+    :param accepted: whether the challenge was kept
+    :param coefficients: the coefficients as used, and the tolerances after this candidate moved them
+    :param artificial: rewards of transitions ``first`` to ``goal``, None if the candidate was rejected
+    """
+
+    rewards: np.ndarray
+    uncertainty: np.ndarray
+    score: np.ndarray
+    disagreement: np.ndarray
+    kl: np.ndarray
+    first: int
+    goal: int
+    verdicts: dict[str, bool]
+    accepted: bool
+    coefficients: dict[str, float]
+    artificial: ArtificialRewards | None
+
+
+class ChallengeCurator:
+    """
+    Quality S, filter F and reward R, applied in turn.
+
+    :param warmup_steps: the first transitions of every trajectory that never count, because the latent state starts at
+        zero and its surprise is meaningless [B.5.2]
+    :param kl_ratio: see :class:`~sb3_cpm.challenges.quality.ChallengeQuality`
+    :param reward_ratio: likewise; F1 uses it too
+    :param filter_kwargs: passed to :class:`~sb3_cpm.challenges.filters.ChallengeFilter`
+    :param reward_kwargs: passed to :class:`~sb3_cpm.challenges.rewards.ArtificialReward`
+    :param coefficient_kwargs: passed to every :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
+    """
+
+    def __init__(
+        self,
+        warmup_steps: int = 5,
+        kl_ratio: float = 0.1,
+        reward_ratio: float = 0.75,
+        filter_kwargs: dict[str, Any] | None = None,
+        reward_kwargs: dict[str, Any] | None = None,
+        coefficient_kwargs: dict[str, Any] | None = None,
+    ):
+        if warmup_steps < 0:
+            raise ValueError(f"warmup_steps must not be negative, got {warmup_steps}")
+        self.warmup_steps = warmup_steps
+        self.quality = ChallengeQuality(kl_ratio, reward_ratio, coefficient_kwargs)
+        self.filter = ChallengeFilter(reward_ratio, **(filter_kwargs or {}))
+        self.reward = ArtificialReward(coefficient_kwargs=coefficient_kwargs, **(reward_kwargs or {}))
+
+    def propose(self, rewards: np.ndarray, evaluation: Evaluation) -> Proposal | None:
+        """
+        :param rewards: task rewards of a complete trajectory, shape ``(n_steps,)``
+        :param evaluation: the challenger's evaluation of the same trajectory
+        :return: the proposal, or None if the trajectory has no transition that counts (n_steps <= warmup_steps)
+        :raises ValueError: for shapes that don't belong together, values that are not finite, negative uncertainty;
+            nothing is changed then
+        """
+        rewards, disagreement, kl, embeddings = _checked(rewards, evaluation)
+        first = self.warmup_steps
+        if len(rewards) == 0:
+            return None
+        self.filter.remember(float(rewards.mean()))
+        if len(rewards) <= first:
+            return None
+
+        uncertainty = self.quality.uncertainty(disagreement, kl, first)
+        score = self.quality.score(rewards, uncertainty, first)
+        goal = best_goal(score, first)
+        mean_reward = float(rewards[first:].mean())
+        accepted, verdicts = self.filter.judge(
+            CandidateStatistics(
+                mean_reward=mean_reward,
+                scaled_reward=self.quality.c.value * mean_reward,
+                mean_uncertainty=float(uncertainty[first:].mean()),
+                mean_score=float(score[first:].mean()),
+                goal_score=float(score[goal]),
+                goal=goal,
+                first=first,
+            )
+        )
+        artificial = None
+        if accepted:
+            kept = slice(first, goal + 1)
+            artificial = self.reward(rewards[kept], uncertainty[kept], embeddings[first : goal + 2])
+        return Proposal(
+            rewards=rewards,
+            uncertainty=uncertainty,
+            score=score,
+            disagreement=disagreement,
+            kl=kl,
+            first=first,
+            goal=goal,
+            verdicts=verdicts,
+            accepted=accepted,
+            coefficients=self.coefficients,
+            artificial=artificial,
+        )
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """All dynamic quantities by the report's names, as they are now (the reward memory is nan before the first trajectory)."""
+        memory = self.filter.reward_memory
+        return {
+            "c": self.quality.c.value,
+            "c1": self.quality.c1.value,
+            "c_expl": self.reward.c_expl.value,
+            "c_emb": self.reward.c_emb.value,
+            "c_step": self.reward.c_step.value,
+            "w1": self.filter.w1.value,
+            "w2": self.filter.w2.value,
+            "w3": self.filter.w3.value,
+            "reward_memory": float("nan") if memory is None else memory,
+        }
+
+
+def _checked(rewards: np.ndarray, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Everything as float64 arrays of the right shapes, or a ValueError that says which one is wrong."""
+    rewards, disagreement, kl, embeddings = (
+        np.asarray(array, dtype=np.float64) for array in (rewards, evaluation.disagreement, evaluation.kl, evaluation.embeddings)
+    )
+    n_steps = len(rewards)
+    for name, array, rows, ndim in (
+        ("rewards", rewards, n_steps, 1),
+        ("disagreement", disagreement, n_steps, 1),
+        ("kl", kl, n_steps, 1),
+        ("embeddings", embeddings, n_steps + 1, 2),
+    ):
+        if array.ndim != ndim or len(array) != rows:
+            wanted = f"({rows},)" if ndim == 1 else f"({rows}, embed_dim)"
+            raise ValueError(f"Evaluation of a {n_steps}-step trajectory: {name} has shape {array.shape}, expected {wanted}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"Evaluation of a {n_steps}-step trajectory: {name} holds NaN or infinite values")
+    return rewards, disagreement, kl, embeddings

@@ -1,0 +1,94 @@
+"""
+Progress-sensitive artificial rewards: what the player gets for the transitions of a challenge.
+
+Report, section 4.4.3 and appendix B.6: task reward, uncertainty, progress toward the goal in the embedding space, and
+progress in steps, halved so that the sum is about as large as the task reward that it replaces.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_cpm.challenges.targeting import DynamicCoefficient
+
+
+@dataclass(frozen=True)
+class ArtificialRewards:
+    """
+    The rewards r' of one challenge, and the terms that they consist of, each times its coefficient, before halving.
+
+    All arrays have the shape ``(length of the challenge,)`` and ``total = scale * (extrinsic + exploration + embedding + step)``.
+    """
+
+    total: np.ndarray
+    extrinsic: np.ndarray
+    exploration: np.ndarray
+    embedding: np.ndarray
+    step: np.ndarray
+
+
+class ArtificialReward:
+    """
+    r' = 0.5 * (r + c_expl * u + c_emb * d_emb + c_step * d_step), with the coefficients following their targets.
+
+    Once they have settled on positive terms, mean(r') = 0.5 * (1 + 2/3 + 0.2 + 0.2) * mean(r) = 1.03 * mean(r).
+
+    :param exploration_ratio: target of mean(c_expl * u) over mean(r), report: 1 / 1.5
+    :param embedding_ratio: target of mean(c_emb * d_emb) over mean(c_expl * u), report: 0.3
+    :param step_ratio: target of mean(c_step * d_step) over mean(c_expl * u), report: 0.3
+    :param scale: factor of the whole sum, report: 0.5
+    :param coefficient_kwargs: passed to each :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
+    """
+
+    def __init__(
+        self,
+        exploration_ratio: float = 1 / 1.5,
+        embedding_ratio: float = 0.3,
+        step_ratio: float = 0.3,
+        scale: float = 0.5,
+        coefficient_kwargs: dict[str, Any] | None = None,
+    ):
+        kwargs = coefficient_kwargs or {}
+        self.scale = scale
+        self.c_expl = DynamicCoefficient(exploration_ratio, **kwargs)
+        self.c_emb = DynamicCoefficient(embedding_ratio, **kwargs)
+        self.c_step = DynamicCoefficient(step_ratio, **kwargs)
+
+    def __call__(self, rewards: np.ndarray, uncertainty: np.ndarray, embeddings: np.ndarray) -> ArtificialRewards:
+        """
+        Relabel the transitions of a challenge of ``n`` steps.
+
+        :param rewards: task rewards r, shape ``(n,)``
+        :param uncertainty: u, shape ``(n,)``
+        :param embeddings: e of every state from the challenge's start to its goal, shape ``(n + 1, embed_dim)``
+        :return: artificial rewards and their terms
+        """
+        d_emb, d_step = embedding_progress(embeddings), step_progress(len(rewards))
+        exploration = self.c_expl.update(uncertainty, rewards) * uncertainty
+        embedding = self.c_emb.update(d_emb, exploration) * d_emb
+        step = self.c_step.update(d_step, exploration) * d_step
+        total = self.scale * (rewards + exploration + embedding + step)
+        return ArtificialRewards(total, rewards, exploration, embedding, step)
+
+
+def embedding_progress(embeddings: np.ndarray) -> np.ndarray:
+    """
+    d_emb: by how much each step comes closer to the last state, in the L1 norm. It sums to the distance of the first
+    state to the last.
+
+    :param embeddings: shape ``(n + 1, embed_dim)``, the last row being the goal's
+    :return: shape ``(n,)``
+    """
+    distance = np.abs(embeddings - embeddings[-1]).sum(axis=-1, dtype=np.float64)
+    return distance[:-1] - distance[1:]
+
+
+def step_progress(n_steps: int) -> np.ndarray:
+    """
+    d_step: position within the challenge over its length; the goal's transition gets 1.
+
+    :param n_steps: length of the challenge
+    :return: shape ``(n_steps,)``
+    """
+    return np.arange(1, n_steps + 1) / n_steps

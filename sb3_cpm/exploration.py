@@ -1,0 +1,276 @@
+"""
+Challenge exploration: how often the challenger acts, and the wrapper through which it does (report, section 4.2).
+
+The report's own decay models are lost (its appendix B.4 is empty); the usual ones are offered here. All follow SB3's
+schedule convention: a function of the remaining progress, which falls from 1 to 0 over ``learn()``.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_cpm.buffers import EXECUTED_ACTION
+from sb3_cpm.challenger import Challenger
+from sb3_cpm.stopwatch import Stopwatch
+
+ExplorationUnit = Literal["step", "segment", "episode"]
+
+# Shapes from 1 at the start (progress 0) to about 0 at the end (progress 1), with their steepness where they have one.
+_DECAYS: dict[str, Callable[[float, float], float]] = {
+    "constant": lambda progress, rate: 1.0,
+    "linear": lambda progress, rate: 1.0 - progress,
+    "exponential": lambda progress, rate: math.exp(-rate * progress),
+    "inverse_time": lambda progress, rate: 1.0 / (1.0 + rate * progress),
+    "cosine": lambda progress, rate: 0.5 * (1.0 + math.cos(math.pi * progress)),
+    "logistic": lambda progress, rate: 1.0 / (1.0 + math.exp(2 * rate * (progress - 0.5))),
+}
+
+
+def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor: float = 0.05, rate: float = 5.0) -> Schedule:
+    """
+    Exploration probability epsilon as a function of the remaining progress.
+
+    :param decay: ``"constant"``, ``"linear"``, ``"exponential"``, ``"inverse_time"``, ``"cosine"``, ``"logistic"``, or a
+        function from remaining progress (1 to 0) to epsilon, which is then used as it is
+    :param start: epsilon that the decay comes from
+    :param floor: epsilon that the decay goes to; the report wants it above zero [4.2]
+    :param rate: steepness of exponential, inverse-time and logistic decay
+    :return: the schedule
+    :raises ValueError: for an unknown name or probabilities outside [0, 1]
+    """
+    if callable(decay):
+        return decay
+    if decay not in _DECAYS:
+        raise ValueError(f"Unknown decay {decay!r}, choose one of {sorted(_DECAYS)} or pass a function of the remaining progress")
+    if not (0 <= floor <= start <= 1):
+        raise ValueError(f"A decay needs 0 <= floor <= start <= 1, got start={start}, floor={floor}")
+    if not rate > 0:
+        raise ValueError(f"rate must be positive, got {rate}")
+    shape = _DECAYS[decay]
+
+    def epsilon(progress_remaining: float) -> float:
+        return floor + (start - floor) * shape(1.0 - progress_remaining, rate)
+
+    return epsilon
+
+
+class ExplorationVecEnv(VecEnvWrapper):
+    """
+    Replaces the player's actions by the challenger's with probability epsilon, while it is ``active``.
+
+    The challenger's latent state follows whoever acts, but lazily: states are kept until the challenger is to act next,
+    then encoded in one go. The action that was executed is reported in ``infos[i]`` wherever it is not the player's.
+
+    :param venv: the environments
+    :param challenger: C
+    :param epsilon: gives the current exploration probability
+    :param last_obs: the observation that the next actions answer to, as kept by the model
+    :param unit: who acts is drawn anew for every ``"step"``, ``"segment"`` of steps, or ``"episode"``, per environment
+    :param segment_length: number of steps in a segment
+    :param stopwatch: charged with "simulate+render" and "C acts"
+    :param on_failure: called when a step fails, before the exception goes on
+    """
+
+    #: The latent state catches up after this many states at the latest, to bound memory.
+    MAX_PENDING = 64
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        challenger: Challenger,
+        epsilon: Callable[[], float],
+        last_obs: dict[str, np.ndarray],
+        unit: ExplorationUnit = "step",
+        segment_length: int = 10,
+        stopwatch: Stopwatch | None = None,
+        on_failure: Callable[[], None] = lambda: None,
+    ):
+        super().__init__(venv)
+        assert isinstance(self.action_space, spaces.Box)
+        self.challenger = challenger
+        self.epsilon = epsilon
+        self.unit = unit
+        self.segment_length = segment_length
+        self.stopwatch = stopwatch or Stopwatch()
+        self.on_failure = on_failure
+        self.active = False
+        #: Number of actions asked for while active, and how many of them the challenger gave.
+        self.n_actions = self.n_explored = 0
+
+        # D holds observations as they were before VecNormalize, and so does C see them
+        self._vec_normalize = unwrap_vec_normalize(venv)
+        self._latent = challenger.initial_state(self.num_envs)
+        self._pending: list[list[_Row]] = [[] for _ in range(self.num_envs)]
+        self._explores = np.zeros(self.num_envs, dtype=bool)
+        self._unit_steps = np.zeros(self.num_envs, dtype=np.int64)  # since who acts was last drawn
+        self._n_steps = 0
+        self._executed = np.zeros((self.num_envs, *self.action_space.shape), dtype=np.float32)
+        for env_idx in range(self.num_envs):
+            self._start_episode(env_idx, last_obs)
+
+    def reset(self) -> VecEnvObs:
+        obs = self.venv.reset()
+        for env_idx in range(self.num_envs):
+            self._start_episode(env_idx, self._original(obs))
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        try:
+            if self.active:
+                with self.stopwatch.section("C acts"):
+                    actions = self._choose_actions(np.array(actions))
+            self.stopwatch.start("simulate+render")
+            self.venv.step_async(actions)
+        except BaseException:
+            self.on_failure()
+            raise
+
+    def step_wait(self) -> VecEnvStepReturn:
+        try:
+            obs, rewards, dones, infos = self.venv.step_wait()
+            self.stopwatch.stop("simulate+render")
+            self._n_steps += 1
+            if self.active:
+                self._check_finite(self._original(obs), rewards, dones, infos)
+                with self.stopwatch.section("C acts"):
+                    self._follow(self._original(obs), dones, infos)
+            return obs, rewards, dones, infos
+        except (EOFError, ConnectionError) as error:
+            self.on_failure()
+            raise RuntimeError(
+                f"An environment process died at step {self._n_steps + 1} of this learn() ({type(error).__name__}). Everything up "
+                "to then is still there: model.save() and model.save_replay_buffer() work, and learn() with "
+                "reset_num_timesteps=False goes on after model.set_env() with new environments."
+            ) from error
+        except BaseException:
+            self.on_failure()
+            raise
+
+    def _original(self, obs: VecEnvObs) -> dict[str, np.ndarray]:
+        if self._vec_normalize is not None:
+            obs = self._vec_normalize.get_original_obs()
+        assert isinstance(obs, dict)
+        return obs
+
+    # ------------------------------------------------------------------ who acts
+
+    def _choose_actions(self, actions: np.ndarray) -> np.ndarray:
+        """:return: the player's actions, replaced where the challenger acts, in the environment's units"""
+        self._draw_who_acts()
+        exploring = np.flatnonzero(self._explores)
+        self._executed = self._scale(actions)
+        if len(exploring):
+            self._executed[exploring] = self._explore(exploring)
+            actions[exploring] = self._unscale(self._executed[exploring])
+        return actions
+
+    def _draw_who_acts(self) -> None:
+        length = {"step": 1, "segment": self.segment_length, "episode": np.inf}[self.unit]
+        due = (self._unit_steps == 0) | (self._unit_steps >= length)
+        draws = np.random.random(self.num_envs) < self.epsilon()
+        self._explores = np.where(due, draws, self._explores)
+        self._unit_steps = np.where(due, 1, self._unit_steps + 1)
+        self.n_actions += self.num_envs
+        self.n_explored += int(self._explores.sum())
+
+    def _explore(self, envs: np.ndarray) -> np.ndarray:
+        """:return: C's actions for some environments, within [-1, 1]; uniform while C has not learned anything yet"""
+        if self.challenger.trained_updates == 0:
+            return np.random.uniform(-1, 1, size=(len(envs), *self.action_space.shape)).astype(np.float32)
+        self._catch_up(envs)
+        return self.challenger.act(self._select(envs)).reshape(len(envs), *self.action_space.shape)
+
+    # ------------------------------------------------------------------ C's latent state
+
+    def _follow(self, obs: dict[str, np.ndarray], dones: np.ndarray, infos: Any) -> None:
+        for env_idx, done in enumerate(dones):
+            if self._explores[env_idx]:
+                infos[env_idx][EXECUTED_ACTION] = self._executed[env_idx].copy()
+            if done:
+                self._start_episode(env_idx, obs)
+            else:
+                self._remember(env_idx, obs, self._executed[env_idx], is_first=False)
+
+    def _start_episode(self, env_idx: int, obs: dict[str, np.ndarray]) -> None:
+        self._pending[env_idx].clear()  # what came before an is_first row doesn't matter
+        self._unit_steps[env_idx] = 0
+        self._remember(env_idx, obs, np.zeros(self.action_space.shape, dtype=np.float32), is_first=True)
+
+    def _remember(self, env_idx: int, obs: dict[str, np.ndarray], action: np.ndarray, is_first: bool) -> None:
+        state = {key: np.array(obs[key][env_idx]) for key in self.challenger.keys}
+        self._pending[env_idx].append(_Row(state, action.copy(), is_first))
+        if len(self._pending[env_idx]) >= self.MAX_PENDING:
+            self._catch_up(np.array([env_idx]))
+
+    def _catch_up(self, envs: np.ndarray) -> None:
+        """Let the latent states of some environments follow what happened since the last time, all in one pass."""
+        pending = [self._pending[env_idx] for env_idx in envs]
+        length = max(map(len, pending))
+        if length == 0:
+            return
+        filler = next(rows[0] for rows in pending if rows)
+        columns = [rows + [filler] * (length - len(rows)) for rows in pending]
+        mask = np.array([[row < len(rows) for rows in pending] for row in range(length)])
+
+        def stacked(read: Callable[[_Row], Any]) -> np.ndarray:
+            return np.stack([np.stack([read(column[row]) for column in columns]) for row in range(length)])
+
+        latent = self.challenger.follow(
+            self._select(envs),
+            {key: stacked(lambda row, key=key: row.observation[key]) for key in self.challenger.keys},
+            stacked(lambda row: row.action).reshape(length, len(envs), -1),
+            stacked(lambda row: row.is_first),
+            mask,
+        )
+        for whole, part in zip(self._latent, latent, strict=True):
+            whole[th.as_tensor(envs)] = part
+        for rows in pending:
+            rows.clear()
+
+    def _select(self, envs: np.ndarray) -> Any:
+        return type(self._latent)(*(tensor[th.as_tensor(envs)] for tensor in self._latent))
+
+    # ------------------------------------------------------------------ actions and checks
+
+    def _scale(self, actions: np.ndarray) -> np.ndarray:
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return (2.0 * (actions - low) / (high - low) - 1.0).astype(np.float32)
+
+    def _unscale(self, scaled: np.ndarray) -> np.ndarray:
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return low + 0.5 * (scaled + 1.0) * (high - low)
+
+    def _check_finite(self, obs: dict[str, np.ndarray], rewards: np.ndarray, dones: np.ndarray, infos: Any) -> None:
+        """NaN spreads from one transition into every network within an update: stop before it is stored."""
+        for env_idx in np.flatnonzero(~np.isfinite(rewards)):
+            raise ValueError(
+                f"Environment {env_idx} gave a reward of {rewards[env_idx]} at step {self._n_steps} of this learn(): rewards must "
+                "be finite. stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
+            )
+        for env_idx in range(self.num_envs):
+            last = infos[env_idx].get("terminal_observation") if dones[env_idx] else None
+            for key, array in obs.items():
+                for value in (array[env_idx],) if last is None else (array[env_idx], last[key]):
+                    if value.dtype.kind == "f" and not np.isfinite(value).all():
+                        raise ValueError(
+                            f"Environment {env_idx} gave NaN or infinite values in observation {key!r} at step {self._n_steps} of "
+                            "this learn(). stable_baselines3.common.vec_env.VecCheckNan helps to find where they come from."
+                        )
+
+
+class _Row:
+    """A state that C's latent state has yet to follow, with the action that led to it."""
+
+    __slots__ = ("action", "is_first", "observation")
+
+    def __init__(self, observation: dict[str, np.ndarray], action: np.ndarray, is_first: bool):
+        self.observation = observation
+        self.action = action
+        self.is_first = is_first
