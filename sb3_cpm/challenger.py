@@ -1,0 +1,461 @@
+"""
+The challenger C: DreamerV2 world model, Plan2Explore ensemble, exploration actor (report, sections 4.1, 4.4.1, B.1 and B.2).
+
+It knows nothing of SB3's training loop: whoever conducts it hands it observations, actions and sequences. All random numbers
+come from torch's global generator, so that one seed rules the run.
+"""
+
+import math
+import os
+import pickle
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.utils import get_device
+
+from sb3_cpm.presets import make_preset
+from sb3_cpm.type_aliases import Evaluation, SequenceBatch
+from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
+from sb3_cpm.uncertainty.base import LatentSizes
+from sb3_cpm.world_model.behavior import ActorCritic, Imagination
+from sb3_cpm.world_model.observations import ObservationSpec
+from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
+from sb3_cpm.world_model.rssm import LatentState
+from sb3_cpm.world_model.world_model import Sequences, WorldModel, WorldModelOutput
+
+FILE_FORMAT = "sb3_cpm challenger"
+FILE_VERSION = 1
+
+Array = np.ndarray | torch.Tensor
+
+
+class Challenger:
+    """
+    World model, uncertainty and exploration behaviour, with everything that trains them.
+
+    :param observation_space: Dict space; images (3-D uint8) and vectors (1-D) are read
+    :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
+    :param device: "auto" takes the GPU where there is one
+    :param preset: "default", "report", or a dict of entries, see :mod:`sb3_cpm.presets`
+    :param keys: the observation keys to read; all images and vectors by default
+    :param uncertainty_class: "plan2explore" or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
+    :param uncertainty_kwargs: arguments for it, on top of the preset's
+    :param overrides: single preset entries
+    :raises ValueError: for spaces it cannot work with and unknown preset entries
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        device: torch.device | str = "auto",
+        preset: str | Mapping[str, Any] = "default",
+        keys: Sequence[str] | None = None,
+        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_kwargs: Mapping[str, Any] | None = None,
+        **overrides: Any,
+    ) -> None:
+        self.preset = make_preset(preset, **overrides)
+        self.device = choose_device(device)
+        check_action_space(action_space)
+        self.action_space = action_space
+        self.action_dim = int(np.prod(action_space.shape))
+        self.spec = ObservationSpec(observation_space, keys, squash=self.preset["symlog_vectors"])
+        self.keys: tuple[str, ...] = self.spec.keys
+        self.batch_size: int = self.preset["batch_size"]
+        self.sequence_length: int = self.preset["sequence_length"]
+        self.trained_updates = 0
+
+        self.world_model = WorldModel(self.spec, self.action_dim, self.preset).to(self.device)
+        self.uncertainty_name, kind, defaults = self._uncertainty_class(uncertainty_class)
+        self.uncertainty_kwargs = {**defaults, **(uncertainty_kwargs or {})}
+        model = self.world_model
+        sizes = LatentSizes(model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim)
+        self.uncertainty = kind(sizes, **self.uncertainty_kwargs).to(self.device)
+        feat = (self.world_model.feat_dim, self.action_dim, self.preset)
+        self.exploration = ActorCritic("exploration", *feat).to(self.device)
+        self.task = ActorCritic("task", *feat).to(self.device) if self.preset["train_task_behavior"] else None
+        self.optimizers = self._make_optimizers()
+
+    def _uncertainty_class(self, kind: str | type[Uncertainty]) -> tuple[str, type[Uncertainty], dict[str, Any]]:
+        """Its name in checkpoints, the class, and the preset's arguments for it."""
+        if isinstance(kind, str):
+            if kind not in UNCERTAINTY_CLASSES:
+                raise ValueError(f"Unknown uncertainty class {kind!r}, valid: {sorted(UNCERTAINTY_CLASSES)} or a class.")
+            return kind, UNCERTAINTY_CLASSES[kind], dict(self.preset["uncertainty"].get(kind, {}))
+        if not (isinstance(kind, type) and issubclass(kind, Uncertainty)):
+            raise ValueError(f"`uncertainty_class` must be a name or a subclass of Uncertainty, got {kind!r}.")
+        return f"{kind.__module__}.{kind.__qualname__}", kind, {}
+
+    def _make_optimizers(self) -> dict[str, Optimizer]:
+        common = {"eps": self.preset["adam_eps"], "clip": self.preset["grad_clip"]}
+        common["weight_decay"] = self.preset["weight_decay"]
+        optimizers = {
+            "world_model": Optimizer("world model", [self.world_model], self.preset["model_lr"], **common),
+            "uncertainty": Optimizer("uncertainty", [self.uncertainty], self.preset["uncertainty_lr"], **common),
+            **self.exploration.make_optimizers(),
+        }
+        if self.task is not None:
+            optimizers.update(self.task.make_optimizers())
+        return optimizers
+
+    # ---- acting ------------------------------------------------------------------------------------------------------
+
+    def initial_state(self, n: int) -> LatentState:
+        """
+        What is believed before anything was seen: zeros.
+
+        :param n: number of environments
+        """
+        with torch.no_grad():
+            return self.world_model.rssm.initial_state(n)
+
+    @torch.no_grad()
+    def follow(
+        self,
+        state: LatentState,
+        observations: Mapping[str, Array],
+        actions: Array,
+        is_first: Array,
+        mask: Array | None = None,
+        deterministic: bool = False,
+    ) -> LatentState:
+        """
+        Let the latent state follow what happened, whoever acted.
+
+        :param state: the state before the first row, ``n`` columns
+        :param observations: per key of shape ``(L, n, *observation_shape)``
+        :param actions: the action that *led to* each row, shape ``(L, n, action_dim)``, within [-1, 1]; ignored in first rows
+        :param is_first: first state of an episode, shape ``(L, n)``, bool; the column forgets everything before
+        :param mask: rows that exist, shape ``(L, n)``, bool; where False the column's state stays as it is
+        :param deterministic: modes instead of samples, no random numbers
+        :return: the state after the last row
+        """
+        first = self._tensor(is_first, torch.bool)
+        length, n = first.shape
+        embed = self.world_model.encoder(self.spec.preprocess(observations, self.device)).unflatten(0, (length, n))
+        rows = self.world_model.rssm.observe(
+            embed,
+            self._tensor(actions).view(length, n, self.action_dim),
+            first,
+            None if mask is None else self._tensor(mask, torch.bool),
+            state,
+            deterministic,
+        )
+        return LatentState(*(part[-1] for part in rows))
+
+    @torch.no_grad()
+    def act(self, state: LatentState, deterministic: bool = False) -> np.ndarray:
+        """
+        Actions of the exploration actor.
+
+        :param state: latent state, ``n`` columns
+        :param deterministic: the policy's mode instead of a sample
+        :return: shape ``(n, action_dim)``, within [-1, 1]
+        """
+        policy = self.exploration.actor(state.feat)
+        return (policy.mode if deterministic else policy.rsample()).cpu().numpy()
+
+    # ---- judging -----------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def evaluate(self, observations: Mapping[str, Array], actions: Array) -> Evaluation:
+        """
+        Opinion of one complete episode of ``T`` transitions. It uses modes and no random numbers: the same episode gets the
+        same opinion, and judging more or fewer episodes changes nothing else in a run.
+
+        :param observations: of the states 0..T, the true last one included, per key of shape ``(T + 1, *observation_shape)``
+        :param actions: action ``t`` was taken in state ``t``, shape ``(T, action_dim)``, within [-1, 1]
+        """
+        taken = self._tensor(actions).view(-1, self.action_dim)
+        length = len(taken) + 1
+        # row t + 1 holds action t, the one that led to it
+        rows = torch.cat((torch.zeros_like(taken[:1]), taken)).unsqueeze(1)
+        first = torch.zeros(length, 1, dtype=torch.bool, device=self.device)
+        first[0] = True
+        embed = self.world_model.encoder(self.spec.preprocess(observations, self.device))
+        if len(embed) != length:
+            raise ValueError(f"An episode of {len(taken)} actions has {length} observations, got {len(embed)}.")
+        posterior = self.world_model.rssm.observe(embed.unsqueeze(1), rows, first, deterministic=True)
+        kl = self.world_model.kl(posterior)[1:, 0]
+        novelty = self.uncertainty.novelty(self._transitions(posterior, rows, embed.unsqueeze(1)))[:, 0]
+        if not (torch.isfinite(kl).all() and torch.isfinite(novelty).all()):
+            raise RuntimeError("KL or disagreement of an episode is not finite: are its observations and actions?")
+        assert not self.uncertainty.nonnegative or bool((novelty >= 0.0).all()), "disagreement below zero"
+        return Evaluation(novelty.float().cpu().numpy(), kl.clamp(min=0.0).cpu().numpy(), embed.cpu().numpy())
+
+    def _transitions(self, posterior: LatentState, actions: torch.Tensor, embed: torch.Tensor) -> Transitions:
+        """
+        Transitions between consecutive rows. State t is paired with the action in row t + 1, which was taken in it.
+
+        :param posterior: batch dimensions ``(L, n)``
+        :param actions: as in a SequenceBatch, shape ``(L, n, action_dim)``
+        :param embed: shape ``(L, n, embed_dim)``
+        :return: batch dimensions ``(L - 1, n)``
+        """
+        expectation = self.world_model.latent.mean(posterior.stats[1:])  # less noisy a target than the sample
+        return Transitions(posterior.feat[:-1], actions[1:], expectation, posterior.deter[1:], embed[1:])
+
+    # ---- learning ----------------------------------------------------------------------------------------------------
+
+    def train(self, batch: SequenceBatch) -> dict[str, float]:
+        """
+        One update of everything: world model, uncertainty, exploration behaviour (and task behaviour if the preset asks).
+
+        :param batch: sequences; its arrays are not changed
+        :return: losses and other numbers worth logging
+        :raises RuntimeError: if a loss is not finite, naming the term; the parts updated before it keep their update
+        """
+        sequences = self._to_device(batch)
+        output = self.world_model.loss(sequences)
+        metrics = self._step_world_model(output)
+        metrics.update(self._train_uncertainty(sequences, output))
+        start = self._imagination_starts(sequences, output)
+        metrics.update(self.exploration.update(self.world_model, start, self._imagined_novelty, self.optimizers))
+        if self.task is not None:
+            metrics.update(self.task.update(self.world_model, start, self._imagined_reward, self.optimizers))
+        self.trained_updates += 1
+        values = torch.stack([value.detach().to(torch.float32) for value in metrics.values()]).tolist()  # one transfer
+        return dict(zip(metrics, values, strict=True))
+
+    def _to_device(self, batch: SequenceBatch) -> Sequences:
+        mask = self._tensor(batch.mask, torch.bool)
+        if not bool(mask.any()):
+            raise ValueError("The batch has no valid row: its mask is False everywhere.")
+        return Sequences(
+            self.spec.preprocess(batch.observations, self.device),
+            self._tensor(batch.actions).view(*mask.shape, self.action_dim),
+            self._tensor(batch.rewards),
+            self._tensor(batch.is_first, torch.bool),
+            self._tensor(batch.is_terminal, torch.bool),
+            mask,
+        )
+
+    def _step_world_model(self, output: WorldModelOutput) -> dict[str, torch.Tensor]:
+        total = torch.stack(list(output.losses.values())).sum()
+        if not torch.isfinite(total):
+            broken = {name: value.item() for name, value in output.losses.items() if not math.isfinite(value.item())}
+            raise RuntimeError(f"The world model's loss became non-finite in the terms {broken or 'that are summed'}. {ADVICE}")
+        norm = self.optimizers["world_model"].step(total)
+        losses = {f"{name}_loss": value for name, value in output.losses.items()}
+        return {"world_model_loss": total, **losses, **output.metrics, "world_model_grad_norm": norm}
+
+    def _train_uncertainty(self, batch: Sequences, output: WorldModelOutput) -> dict[str, torch.Tensor]:
+        transitions = self._transitions(output.posterior, batch.actions, output.embed)
+        # neither into padding nor from the last state of one episode to the first of the next
+        valid = batch.mask[1:] & batch.mask[:-1] & ~batch.is_first[1:]
+        transitions = Transitions(*(part[valid] for part in transitions if part is not None))
+        if not len(transitions.feat):
+            return {}
+        loss = self.uncertainty.loss(transitions)
+        norm = self.optimizers["uncertainty"].step(loss)
+        return {"uncertainty_loss": loss, "uncertainty_grad_norm": norm, **self.uncertainty.adapt(transitions)}
+
+    def _imagination_starts(self, batch: Sequences, output: WorldModelOutput) -> LatentState:
+        """Posterior states to imagine from: rows that exist and do not end an episode, all or a random choice of them."""
+        valid = batch.mask & ~batch.is_terminal
+        index = (valid if bool(valid.any()) else batch.mask).flatten().nonzero().squeeze(1)
+        limit = self.preset["imagination_starts"]
+        if limit is not None and len(index) > limit:
+            index = index[torch.randperm(len(index), device=self.device)[:limit]]
+        return output.posterior.flatten().select(index)
+
+    def _imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
+        return self.uncertainty.novelty(
+            Transitions(imagined.feats[:-1], imagined.actions, imagined.stochs[1:], imagined.deters[1:])
+        )
+
+    def _imagined_reward(self, imagined: Imagination) -> torch.Tensor:
+        return self.world_model.reward(imagined.feats[1:])
+
+    def _tensor(self, array: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        return torch.as_tensor(array, device=self.device).to(dtype)
+
+    # ---- saving ------------------------------------------------------------------------------------------------------
+
+    @property
+    def networks(self) -> dict[str, torch.nn.Module]:
+        """Everything with weights, by name."""
+        parts: dict[str, torch.nn.Module] = {
+            "world_model": self.world_model,
+            "uncertainty": self.uncertainty,
+            "exploration": self.exploration,
+        }
+        return parts if self.task is None else {**parts, "task": self.task}
+
+    def state_dict(self, include_rng: bool = True) -> dict[str, Any]:
+        """
+        Networks, optimizers, scales and counters.
+
+        :param include_rng: also torch's global random state
+        """
+        state: dict[str, Any] = {
+            "networks": {name: network.state_dict() for name, network in self.networks.items()},
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "trained_updates": self.trained_updates,
+        }
+        if include_rng:
+            cuda = [rng.cpu() for rng in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else []
+            state["rng"] = {"cpu": torch.get_rng_state(), "cuda": cuda}
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any], restore_rng: bool = False) -> None:
+        """
+        :param state: of :meth:`state_dict`
+        :param restore_rng: also set torch's global random state, where the state has one
+        :raises ValueError: if it belongs to a challenger of other sizes, naming the first mismatch; nothing is changed then
+        """
+        for name, network in self.networks.items():
+            check_sizes(name, network.state_dict(), state["networks"].get(name, {}))
+        for name, network in self.networks.items():
+            network.load_state_dict(state["networks"][name])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.trained_updates = int(state["trained_updates"])
+        if restore_rng and "rng" in state:
+            torch.set_rng_state(state["rng"]["cpu"].cpu())
+            if torch.cuda.is_available() and len(state["rng"]["cuda"]) == torch.cuda.device_count():
+                torch.cuda.set_rng_state_all([rng.cpu() for rng in state["rng"]["cuda"]])
+
+    def save(self, path: str | os.PathLike, include_rng: bool = True) -> None:
+        """
+        Write everything to one file; a file that is there already is replaced only by a complete one.
+
+        :param path: of the file
+        :param include_rng: also torch's global random state
+        """
+        content = {
+            "format": FILE_FORMAT,
+            "version": FILE_VERSION,
+            "config": self._config(),
+            "state": self.state_dict(include_rng),
+        }
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = target.with_name(f"{target.name}.{os.getpid()}.tmp")
+        try:
+            with open(unfinished, "wb") as file:
+                torch.save(content, file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, target)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def _config(self) -> dict[str, Any]:
+        """Plain data only: files are read without executing anything in them."""
+        keys = {
+            key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys
+        }
+        action = {"low": self.action_space.low.tolist(), "high": self.action_space.high.tolist()}
+        return {
+            "keys": keys,
+            "action": action,
+            "preset": self.preset,
+            "uncertainty_class": self.uncertainty_name,
+            "uncertainty_kwargs": self.uncertainty_kwargs,
+        }
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike,
+        device: torch.device | str = "auto",
+        uncertainty_class: type[Uncertainty] | None = None,
+        restore_rng: bool = False,
+    ) -> "Challenger":
+        """
+        A challenger from a file of :meth:`save`.
+
+        :param path: of the file
+        :param device: may be another one than it was saved from
+        :param uncertainty_class: needed where it was built with a class of your own
+        :param restore_rng: also set torch's global random state
+        :raises ValueError: for files that are damaged or something else
+        """
+        target = choose_device(device)
+        content = read_file(path, target)
+        config = content["config"]
+        name = config["uncertainty_class"]
+        if uncertainty_class is None and name not in UNCERTAINTY_CLASSES:
+            raise ValueError(f"{path} was saved with the uncertainty class {name}: pass it as `uncertainty_class`.")
+        challenger = cls(
+            spaces.Dict({key: _space(entry) for key, entry in config["keys"].items()}),
+            spaces.Box(np.float32(config["action"]["low"]), np.float32(config["action"]["high"])),
+            target,
+            config["preset"],
+            tuple(config["keys"]),
+            name if uncertainty_class is None else uncertainty_class,
+            config["uncertainty_kwargs"],
+        )
+        challenger.load_state_dict(content["state"], restore_rng)
+        return challenger
+
+
+def _space(entry: Mapping[str, Any]) -> spaces.Box:
+    if entry["image"]:
+        return spaces.Box(0, 255, tuple(entry["shape"]), np.uint8)
+    return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)
+
+
+def choose_device(device: torch.device | str) -> torch.device:
+    """SB3's choice, but an explicit GPU that is not there is an error instead of a silent CPU."""
+    if str(device).startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"Device {str(device)!r} was asked for, but torch sees no GPU. Use device='auto' or 'cpu'.")
+    return get_device(device)
+
+
+def check_action_space(space: spaces.Space) -> None:
+    """
+    :raises ValueError: unless it is a bounded Box
+    """
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"The challenger needs a continuous action space (Box), got {space}.")
+    if not np.prod(space.shape):
+        raise ValueError(f"The action space {space} has no dimension to act in.")
+    if not space.is_bounded():
+        raise ValueError(
+            f"The action space must be bounded on both sides, got {space}. Rescale it, for example with "
+            "gymnasium.wrappers.RescaleAction, or state the bounds that the environment clips to."
+        )
+
+
+def check_sizes(name: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+    """
+    :raises ValueError: naming the first weight that is missing, unknown or of another shape
+    """
+    for key, value in own.items():
+        if key not in other:
+            raise ValueError(f"The saved challenger has no weight {name}.{key}: it was built with another preset or space.")
+        if tuple(other[key].shape) != tuple(value.shape):
+            raise ValueError(
+                f"The saved challenger has other sizes: {name}.{key} is {tuple(other[key].shape)} there and "
+                f"{tuple(value.shape)} here. Build it with the preset and spaces it was saved with, or use Challenger.load."
+            )
+    for key in other:
+        if key not in own:
+            raise ValueError(f"The saved challenger has an additional weight {name}.{key}: it was built with another preset.")
+
+
+def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
+    """
+    Content of a saved challenger, checked.
+
+    :raises ValueError: for files that are missing, damaged or something else
+    """
+    if not Path(path).is_file():
+        raise ValueError(f"There is no file {path}.")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        raise ValueError(f"{path} is damaged or no saved challenger ({type(error).__name__}: {error}).") from error
+    if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
+        raise ValueError(f"{path} is no saved challenger.")
+    if content.get("version") != FILE_VERSION:
+        raise ValueError(f"{path} has file version {content.get('version')}, this package reads {FILE_VERSION}.")
+    return content

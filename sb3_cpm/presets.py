@@ -1,0 +1,127 @@
+"""
+Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; SPEC of the method in the documentation).
+
+``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. ``"default"`` is
+small enough for two CPU cores. A preset of your own is a dict with the entries that differ from ``"default"``; every
+entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
+"""
+
+import difflib
+from collections.abc import Mapping
+from typing import Any
+
+REPORT: dict[str, Any] = {
+    # what train() is fed with
+    "batch_size": 16,  # sequences per update
+    "sequence_length": 50,  # rows per sequence
+    # encoder and decoder
+    "cnn_depth": 32,  # channels of the first convolution
+    "cnn_layers": 4,  # convolutions, each halves the image; 32x32 becomes 2x2 and an embedding of 32 * cnn_depth
+    "vector_layers": 2,  # hidden layers of the MLPs that encode and decode vectors
+    "vector_units": 400,  # size of each of them
+    "symlog_vectors": True,  # squash vectors with symlog: robust to whatever range the environment uses
+    # latent state
+    "latent": "gaussian",  # "gaussian" (report) or "categorical" (DreamerV2)
+    "stoch_size": 50,  # stochastic dimensions; number of variables if categorical (32 in DreamerV2)
+    "stoch_classes": 32,  # classes of each variable, categorical only
+    "deter_size": 200,  # deterministic dimensions, units of the GRU
+    "hidden_size": 200,  # size of the layers around the GRU
+    # heads
+    "head_layers": 2,  # hidden layers of reward and continue head
+    "head_units": 400,  # size of each of them
+    "symlog_rewards": False,  # learn symlog(reward), for rewards far from [-1, 1]
+    "reward_gradient": True,  # let the reward shape the latents
+    "continue_head": True,  # learn where episodes terminate
+    # losses
+    "kl_balance": 0.8,  # share of the prior's side of the KL
+    "kl_scale": 1.0,  # factor of the KL
+    "free_nats": 1.0,  # KL (batch mean, nats) that costs nothing
+    "reward_scale": 1.0,  # factor of the reward loss
+    "continue_scale": 1.0,  # factor of the continue loss
+    # optimisation
+    "model_lr": 3e-4,  # learning rate of the world model
+    "actor_lr": 8e-5,  # learning rate of the actors
+    "critic_lr": 8e-5,  # learning rate of the critics
+    "uncertainty_lr": 3e-4,  # learning rate of the ensemble
+    "adam_eps": 1e-5,  # epsilon of Adam
+    "grad_clip": 100.0,  # greatest gradient norm
+    "weight_decay": 1e-6,  # share of each weight taken away per update
+    # behaviour in imagination
+    "horizon": 15,  # imagined steps
+    "imagination_starts": None,  # how many states of a batch imagination starts from, None for all
+    "gamma": 0.99,  # discount
+    "lambda_": 0.95,  # of the lambda-returns
+    "entropy_scale": 1e-4,  # reward for the actor's entropy
+    "actor_layers": 4,  # hidden layers
+    "actor_units": 400,  # size of each of them
+    "critic_layers": 3,  # hidden layers
+    "critic_units": 400,  # size of each of them
+    "slow_target": True,  # bootstrap from a slow copy of the critic
+    "slow_target_every": 100,  # updates between two copies
+    "train_task_behavior": False,  # also train an actor-critic for the task; the challenger does not act with it
+    # constructor arguments of uncertainty classes, by name; `uncertainty_kwargs` come on top
+    "uncertainty": {"plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "feat", "metric": "exp"}},
+}
+
+DEFAULT: dict[str, Any] = {
+    **REPORT,
+    "batch_size": 8,
+    "sequence_length": 32,
+    "cnn_depth": 8,
+    "vector_units": 128,
+    "stoch_size": 30,
+    "deter_size": 128,
+    "hidden_size": 128,
+    "head_units": 128,
+    "symlog_rewards": True,
+    "model_lr": 1e-3,
+    "actor_lr": 3e-4,
+    "critic_lr": 3e-4,
+    "uncertainty_lr": 1e-3,
+    "imagination_starts": 128,
+    "actor_layers": 2,
+    "actor_units": 128,
+    "critic_layers": 2,
+    "critic_units": 128,
+    "uncertainty": {"plan2explore": {"heads": 5, "layers": 2, "units": 128, "target": "feat", "metric": "exp"}},
+}
+
+PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}
+
+_POSITIVE_INTEGERS = (
+    "batch_size sequence_length cnn_depth cnn_layers vector_units stoch_size stoch_classes deter_size hidden_size head_units "
+    "horizon actor_units critic_units slow_target_every"
+).split()
+
+
+def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -> dict[str, Any]:
+    """
+    A complete preset.
+
+    :param preset: name of a preset, or the entries that differ from "default"
+    :param overrides: further entries, they win
+    :raises ValueError: for unknown names (with the nearest valid one) and sizes that are no positive integers
+    """
+    if isinstance(preset, str):
+        if preset not in PRESETS:
+            raise ValueError(f"Unknown preset {preset!r}.{_suggest(preset, PRESETS)} Valid: {sorted(PRESETS)}.")
+        result = dict(PRESETS[preset])
+    elif isinstance(preset, Mapping):
+        result, overrides = dict(DEFAULT), {**preset, **overrides}
+    else:
+        raise ValueError(f"`preset` must be a name ({sorted(PRESETS)}) or a dict of entries, got {preset!r}.")
+    for key in overrides:
+        if key not in result:
+            raise ValueError(f"Unknown preset entry {key!r}.{_suggest(key, result)} Valid: {sorted(result)}.")
+    result.update(overrides)
+    for key in _POSITIVE_INTEGERS:
+        if not isinstance(result[key], int) or isinstance(result[key], bool) or result[key] < 1:
+            raise ValueError(f"Preset entry {key!r} must be an integer of at least 1, got {result[key]!r}.")
+    if result["sequence_length"] < 2:
+        raise ValueError("Preset entry 'sequence_length' must be at least 2: a transition has two rows.")
+    return result
+
+
+def _suggest(name: str, valid: Mapping[str, Any]) -> str:
+    matches = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)
+    return f" Did you mean {matches[0]!r}?" if matches else ""

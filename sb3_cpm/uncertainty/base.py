@@ -1,0 +1,85 @@
+"""
+The seam for novelty measures (report, section 4.4.1: DISAG in u_t; also the reward of C's exploration actor).
+
+A measure sees transitions between latent states. It may learn from real ones (:meth:`Uncertainty.loss`), must rate real and
+imagined ones (:meth:`Uncertainty.novelty`), and may adjust its scale to what it sees (:meth:`Uncertainty.adapt`). Random
+network distillation would rate ``next_stoch`` and ``next_deter`` and ignore the rest; a prediction error needs ``next_embed``
+and therefore falls back on the latents in imagination, where nothing was observed.
+"""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+
+class Transitions(NamedTuple):
+    """
+    Transitions t -> t+1 between latent states, any batch dimensions.
+
+    :param feat: whole latent of state t, shape ``(*batch, feat_dim)``
+    :param action: the action taken *in state t*, shape ``(*batch, action_dim)``. In a
+        :class:`~sb3_cpm.type_aliases.SequenceBatch` that is the action stored in row t+1; the one in row t led to state t
+        and says nothing about state t+1
+    :param next_stoch: expectation of the stochastic part of state t+1 (a sample in imagination), shape ``(*batch, stoch_size)``
+    :param next_deter: deterministic part of state t+1, shape ``(*batch, deter_size)``
+    :param next_embed: encoder output of state t+1, shape ``(*batch, embed_dim)``; None in imagination
+    """
+
+    feat: torch.Tensor
+    action: torch.Tensor
+    next_stoch: torch.Tensor
+    next_deter: torch.Tensor
+    next_embed: torch.Tensor | None = None
+
+
+class LatentSizes(NamedTuple):
+    """Sizes of what a measure reads and predicts."""
+
+    feat: int
+    action: int
+    stoch: int
+    deter: int
+    embed: int
+
+
+class Uncertainty(nn.Module, ABC):
+    """
+    Abstract novelty measure. Subclasses take ``sizes`` first and their own keyword arguments after it (they come from
+    ``uncertainty_kwargs``). Everything that has to survive a checkpoint is a parameter or a registered buffer.
+    """
+
+    #: novelty is at least 0 by construction, which S, F and R may rely on; checked at every evaluation
+    nonnegative: bool = True
+
+    def __init__(self, sizes: LatentSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+
+    @abstractmethod
+    def novelty(self, transitions: Transitions) -> torch.Tensor:
+        """
+        How new each transition is, differentiable with respect to ``feat`` and ``action``: the exploration actor climbs
+        along this gradient.
+
+        :param transitions: real or imagined
+        :return: shape ``(*batch,)``
+        """
+
+    @abstractmethod
+    def loss(self, transitions: Transitions) -> torch.Tensor:
+        """
+        What one update minimises, a scalar. Transitions across episode boundaries and into padding are already left out.
+
+        :param transitions: real ones without gradients, batch dimension ``(n,)``
+        """
+
+    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+        """
+        Adjust whatever is adjusted by rule instead of by gradient; called once after each update.
+
+        :param transitions: those of the update
+        :return: numbers worth logging, detached scalars
+        """
+        return {"disagreement": self.novelty(transitions).mean().detach()}

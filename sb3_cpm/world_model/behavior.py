@@ -1,0 +1,161 @@
+"""
+Actor and critic that learn in imagination (report, B.1; Hafner et al. 2021, section 3): one class for the task and for
+exploration, which differ in nothing but the reward that they are given.
+
+Imagined states have indices 0..H, actions and rewards 0..H-1: action i is taken in state i, reward i is for arriving in state
+i + 1, and so is return i. Gradients of the returns flow back through the learned dynamics into the actions.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from sb3_cpm.world_model.distributions import TruncatedNormal
+from sb3_cpm.world_model.losses import lambda_returns
+from sb3_cpm.world_model.networks import MLP, initialize
+from sb3_cpm.world_model.optimizer import Optimizer
+from sb3_cpm.world_model.rssm import LatentState
+from sb3_cpm.world_model.world_model import WorldModel
+
+
+class Imagination(NamedTuple):
+    """
+    :param feats: latents of the states 0..H, shape ``(H + 1, n, feat_dim)``
+    :param stochs: their stochastic part, shape ``(H + 1, n, stoch_size)``
+    :param deters: their deterministic part, shape ``(H + 1, n, deter_size)``
+    :param actions: shape ``(H, n, action_dim)``, within [-1, 1]
+    :param entropies: of the actor in the states 0..H-1, shape ``(H, n)``
+    """
+
+    feats: torch.Tensor
+    stochs: torch.Tensor
+    deters: torch.Tensor
+    actions: torch.Tensor
+    entropies: torch.Tensor
+
+
+RewardFunction = Callable[[Imagination], torch.Tensor]
+
+
+class Actor(nn.Module):
+    """
+    Latents to a truncated normal over actions in [-1, 1].
+
+    :param feat_dim: size of the latent
+    :param action_dim: number of action dimensions
+    :param layers: hidden layers
+    :param units: size of each of them
+    """
+
+    min_std = 0.1
+
+    def __init__(self, feat_dim: int, action_dim: int, layers: int, units: int) -> None:
+        super().__init__()
+        self.net = MLP(feat_dim, layers, units, 2 * action_dim)
+        self.apply(initialize)
+
+    def forward(self, feat: torch.Tensor) -> TruncatedNormal:
+        mean, raw = self.net(feat).chunk(2, dim=-1)
+        return TruncatedNormal(torch.tanh(mean), 2.0 * torch.sigmoid(0.5 * raw) + self.min_std)
+
+
+class ActorCritic(nn.Module):
+    """
+    :param name: prefix of its log keys, "task" or "exploration"
+    :param feat_dim: size of the latent
+    :param action_dim: number of action dimensions
+    :param preset: sizes and constants, see :mod:`sb3_cpm.presets`
+    """
+
+    updates: torch.Tensor
+
+    def __init__(self, name: str, feat_dim: int, action_dim: int, preset: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.name, self.preset = name, preset
+        self.actor = Actor(feat_dim, action_dim, preset["actor_layers"], preset["actor_units"])
+        self.critic = self._make_critic(feat_dim)
+        self.target_critic = self.critic
+        if preset["slow_target"]:
+            self.target_critic = self._make_critic(feat_dim).requires_grad_(False)
+            self.target_critic.load_state_dict(self.critic.state_dict())
+        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+
+    def _make_critic(self, feat_dim: int) -> MLP:
+        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1).apply(initialize)  # type: ignore
+
+    def make_optimizers(self) -> dict[str, Optimizer]:
+        """Optimizers of actor and critic, by name."""
+        common = {key: self.preset[name] for key, name in (("eps", "adam_eps"), ("clip", "grad_clip"))}
+        common["weight_decay"] = self.preset["weight_decay"]
+        parts = {"actor": (self.actor, "actor_lr"), "critic": (self.critic, "critic_lr")}
+        return {
+            f"{self.name}_{part}": Optimizer(f"{self.name} {part}", [module], self.preset[rate], **common)
+            for part, (module, rate) in parts.items()
+        }
+
+    def imagine(self, world_model: WorldModel, start: LatentState) -> Imagination:
+        """
+        Let the actor act in the world model for ``horizon`` steps.
+
+        :param world_model: supplies the dynamics; its weights get no gradient
+        :param start: states to start in, batch dimension ``(n,)``, without gradient
+        """
+        states, feats, actions, entropies = [start], [start.feat], [], []
+        for _ in range(self.preset["horizon"]):
+            policy = self.actor(feats[-1])
+            actions.append(policy.rsample())
+            entropies.append(policy.entropy())
+            states.append(world_model.rssm.imagine_step(states[-1], actions[-1]))
+            feats.append(states[-1].feat)
+        return Imagination(
+            torch.stack(feats),
+            torch.stack([state.stoch for state in states]),
+            torch.stack([state.deter for state in states]),
+            torch.stack(actions),
+            torch.stack(entropies),
+        )
+
+    def update(
+        self, world_model: WorldModel, start: LatentState, reward: RewardFunction, optimizers: Mapping[str, Optimizer]
+    ) -> dict[str, torch.Tensor]:
+        """
+        One update of actor and critic.
+
+        :param world_model: supplies dynamics and continuation
+        :param start: states to start in, batch dimension ``(n,)``
+        :param reward: differentiable, returns shape ``(H, n)`` for an imagination
+        :param optimizers: those of :meth:`make_optimizers`
+        :return: numbers worth logging, detached scalars
+        """
+        imagined = self.imagine(world_model, start)
+        rewards = reward(imagined)
+        discounts = self.preset["gamma"] * world_model.continue_probability(imagined.feats[1:])
+        values = self.target_critic(imagined.feats[1:]).squeeze(-1)
+        returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
+        # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
+        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
+
+        actor_loss = -(reached * (returns + self.preset["entropy_scale"] * imagined.entropies)).mean()
+        actor_norm = optimizers[f"{self.name}_actor"].step(actor_loss)
+        predicted = self.critic(imagined.feats[:-1].detach()).squeeze(-1)
+        critic_loss = (reached * 0.5 * (predicted - returns.detach()).square()).mean()
+        critic_norm = optimizers[f"{self.name}_critic"].step(critic_loss)
+        self._follow_slowly()
+        metrics = {
+            "actor_loss": actor_loss,
+            "critic_loss": critic_loss,
+            "actor_grad_norm": actor_norm,
+            "critic_grad_norm": critic_norm,
+            "imagined_reward": rewards.mean(),
+            "imagined_return": returns.mean(),
+            "entropy": imagined.entropies.mean(),
+        }
+        return {f"{self.name}_{key}": value.detach() for key, value in metrics.items()}
+
+    def _follow_slowly(self) -> None:
+        """Hard copy of the critic into the slow target every ``slow_target_every`` updates."""
+        self.updates += 1
+        if self.preset["slow_target"] and int(self.updates) % self.preset["slow_target_every"] == 0:
+            self.target_critic.load_state_dict(self.critic.state_dict())

@@ -1,0 +1,143 @@
+"""
+The distributions of Dreamer: stochastic latents (Gaussian as in the report, categorical as in DreamerV2) and a truncated
+normal for bounded actions that really is one.
+
+They work on plain tensors of parameters ("stats") instead of ``torch.distributions`` objects: whole sequences can then be
+stacked, masked and indexed without any bookkeeping.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+
+SQRT_2PI = math.sqrt(2.0 * math.pi)
+SQRT_2 = math.sqrt(2.0)
+
+
+class GaussianLatent:
+    """
+    Diagonal Gaussian latents, std = 2 * sigmoid(x / 2) + ``min_std``.
+
+    :param size: number of stochastic dimensions (50 in the report)
+    """
+
+    min_std = 0.1
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.stats_size = 2 * size
+
+    def mean_std(self, stats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, raw = stats.chunk(2, dim=-1)
+        return mean, 2.0 * torch.sigmoid(0.5 * raw) + self.min_std
+
+    def noise(self, *batch: int, like: torch.Tensor) -> torch.Tensor:
+        """Random numbers for samples of shape ``(*batch, size)``; drawn at once for a whole sequence."""
+        return torch.randn(*batch, self.size, device=like.device, dtype=like.dtype)
+
+    def sample(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Reparametrised sample."""
+        mean, std = self.mean_std(stats)
+        return torch.addcmul(mean, std, noise)
+
+    def mode(self, stats: torch.Tensor) -> torch.Tensor:
+        return stats[..., : self.size]
+
+    def mean(self, stats: torch.Tensor) -> torch.Tensor:
+        return stats[..., : self.size]
+
+    def kl(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        """KL(left || right) in nats, summed over the dimensions, shape ``(*batch,)``."""
+        (mean, std), (other_mean, other_std) = self.mean_std(left), self.mean_std(right)
+        ratio = (std / other_std).square()
+        distance = ((mean - other_mean) / other_std).square()
+        return 0.5 * (ratio + distance - 1.0 - ratio.log()).sum(-1)
+
+
+class CategoricalLatent:
+    """
+    ``groups`` one-hot latents of ``classes`` classes with straight-through gradients (DreamerV2: 32 x 32).
+
+    :param groups: number of categorical variables
+    :param classes: classes of each
+    """
+
+    def __init__(self, groups: int, classes: int) -> None:
+        self.groups, self.classes = groups, classes
+        self.size = self.stats_size = groups * classes
+
+    def _logits(self, stats: torch.Tensor) -> torch.Tensor:
+        return stats.unflatten(-1, (self.groups, self.classes))
+
+    def noise(self, *batch: int, like: torch.Tensor) -> torch.Tensor:
+        """Gumbel noise for samples of shape ``(*batch, size)``."""
+        return -torch.empty(*batch, self.size, device=like.device, dtype=like.dtype).exponential_().log()
+
+    def sample(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        logits = self._logits(stats)
+        hard = F.one_hot((logits.detach() + self._logits(noise)).argmax(-1), self.classes).to(stats.dtype)
+        probabilities = F.softmax(logits, dim=-1)
+        return (hard + probabilities - probabilities.detach()).flatten(-2)
+
+    def mode(self, stats: torch.Tensor) -> torch.Tensor:
+        return F.one_hot(self._logits(stats).argmax(-1), self.classes).to(stats.dtype).flatten(-2)
+
+    def mean(self, stats: torch.Tensor) -> torch.Tensor:
+        return F.softmax(self._logits(stats), dim=-1).flatten(-2)
+
+    def kl(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        log_left = F.log_softmax(self._logits(left), dim=-1)
+        log_right = F.log_softmax(self._logits(right), dim=-1)
+        return (log_left.exp() * (log_left - log_right)).sum((-1, -2))
+
+
+Latent = GaussianLatent | CategoricalLatent
+
+
+class TruncatedNormal:
+    """
+    Normal distribution restricted to [-1, 1] and renormalised, independent in its last dimension.
+
+    Samples come from the inverse of the cumulative distribution, which makes them differentiable in both parameters.
+    Clipping a normal sample instead puts mass on the bounds and cuts the gradient there.
+
+    :param loc: mode, within [-1, 1], shape ``(..., action_dim)``
+    :param scale: standard deviation before truncation, shape ``(..., action_dim)``
+    """
+
+    def __init__(self, loc: torch.Tensor, scale: torch.Tensor) -> None:
+        self.loc, self.scale = loc, scale
+        self.alpha, self.beta = (-1.0 - loc) / scale, (1.0 - loc) / scale
+        self._low = torch.special.ndtr(self.alpha)
+        self._mass = torch.special.ndtr(self.beta) - self._low  # at least ndtr(20) - 1/2, since loc lies inside
+
+    @property
+    def mode(self) -> torch.Tensor:
+        return self.loc
+
+    @property
+    def mean(self) -> torch.Tensor:
+        return self.loc + self.scale * (self._density(self.alpha) - self._density(self.beta)) / self._mass
+
+    def rsample(self) -> torch.Tensor:
+        """Sample with gradients, within [-1, 1], shape ``(..., action_dim)``."""
+        quantile = self._low + self._mass * torch.rand_like(self.loc)
+        # at the very ends float32 has no quantile left: stay where ndtri and its slope are finite
+        standard = torch.special.ndtri(quantile.clamp(1e-6, 1.0 - 1e-6))
+        return torch.addcmul(self.loc, self.scale, standard).clamp(-1.0, 1.0)
+
+    def log_prob(self, value: torch.Tensor) -> torch.Tensor:
+        """Log density of ``value``, summed over the last dimension; -inf outside of [-1, 1]."""
+        standard = (value - self.loc) / self.scale
+        log_density = -0.5 * standard.square() - (SQRT_2PI * self.scale * self._mass).log()
+        return log_density.masked_fill(value.abs() > 1.0, -math.inf).sum(-1)
+
+    def entropy(self) -> torch.Tensor:
+        """Differential entropy in nats, summed over the last dimension."""
+        shift = self.alpha * self._density(self.alpha) - self.beta * self._density(self.beta)
+        return ((SQRT_2PI * math.sqrt(math.e) * self.scale * self._mass).log() + shift / (2.0 * self._mass)).sum(-1)
+
+    @staticmethod
+    def _density(x: torch.Tensor) -> torch.Tensor:
+        return torch.exp(-0.5 * x.square()) / SQRT_2PI

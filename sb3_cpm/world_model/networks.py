@@ -1,0 +1,184 @@
+"""
+The building blocks of the world model (report, B.1): MLPs, convolutional encoder and decoder, layer-norm GRU cell.
+"""
+
+import torch
+from torch import nn
+
+from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
+
+
+def initialize(module: nn.Module) -> None:
+    """Glorot initialisation as in Dreamer's TensorFlow original; use with ``module.apply(initialize)``."""
+    if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+        nn.init.xavier_uniform_(module.weight)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+
+
+class MLP(nn.Sequential):
+    """
+    Dense layers with ELU, and a linear output layer where ``output_dim`` is given.
+
+    :param input_dim: size of the input
+    :param layers: number of hidden layers
+    :param units: size of each of them
+    :param output_dim: size of the linear output layer; None ends with the last hidden layer's ELU
+    """
+
+    def __init__(self, input_dim: int, layers: int, units: int, output_dim: int | None = None) -> None:
+        modules: list[nn.Module] = []
+        for _ in range(layers):
+            modules += [nn.Linear(input_dim, units), nn.ELU()]
+            input_dim = units
+        if output_dim is not None:
+            modules.append(nn.Linear(input_dim, output_dim))
+        super().__init__(*modules)
+        self.output_dim = input_dim if output_dim is None else output_dim
+
+
+class GRUCell(nn.Module):
+    """
+    GRU with layer norm over all gates and an update bias of -1: a fresh cell keeps most of its memory (DreamerV2).
+
+    :param input_dim: size of the input
+    :param size: size of the hidden state
+    """
+
+    update_bias = -1.0
+
+    def __init__(self, input_dim: int, size: int) -> None:
+        super().__init__()
+        self.gates = nn.Linear(input_dim + size, 3 * size, bias=False)
+        self.norm = nn.LayerNorm(3 * size)
+
+    def forward(self, inputs: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+        gates = self.norm(self.gates(torch.cat((inputs, hidden), dim=-1)))
+        reset, candidate, update = gates.chunk(3, dim=-1)
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        return torch.lerp(hidden, candidate, torch.sigmoid(update + self.update_bias))
+
+
+def cnn_layer_count(height: int, width: int, wanted: int) -> int:
+    """
+    How many halvings an image gets: ``wanted``, fewer for images so small that no 2x2 feature map would be left.
+
+    :raises ValueError: if the image cannot be halved that often
+    """
+    layers = wanted
+    while layers > 1 and min(height, width) // 2**layers < MIN_FEATURE_MAP:
+        layers -= 1
+    step = 2**layers
+    if height % step or width % step:
+        raise ValueError(
+            f"Images of {height}x{width} pixels cannot be halved {layers} times. Render them at a multiple of {step} pixels "
+            f"per side (for example 32 or 64), or lower `cnn_layers`."
+        )
+    return layers
+
+
+class ConvEncoder(nn.Module):
+    """
+    Strided convolutions, each of which halves the image: 4 layers of depth 32 turn 32x32 into 2x2x256, the report's
+    embedding of 32 * depth.
+
+    With kernel 4, stride 2 and padding 1, encoder and decoder are mirror images at any size; DreamerV2's kernels without
+    padding fit 64x64 only.
+
+    :param image_shape: ``(channels, height, width)``
+    :param depth: channels of the first layer, doubled by each further one up to 8 * depth
+    :param layers: number of convolutions
+    """
+
+    def __init__(self, image_shape: tuple[int, int, int], depth: int, layers: int) -> None:
+        super().__init__()
+        channels, height, width = image_shape
+        layers = cnn_layer_count(height, width, layers)
+        modules: list[nn.Module] = []
+        for layer in range(layers):
+            out = depth * min(2**layer, 8)
+            modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), nn.ELU()]
+            channels = out
+        self.convolutions = nn.Sequential(*modules).to(memory_format=torch.channels_last)
+        self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return self.convolutions(images).flatten(1)
+
+
+class ConvDecoder(nn.Module):
+    """
+    Mirror image of :class:`ConvEncoder` behind a linear layer; its output is the mean of a unit-variance Gaussian.
+
+    :param input_dim: size of the latent
+    :param image_shape: ``(channels, height, width)``
+    :param depth: channels before the last layer
+    :param layers: number of transposed convolutions
+    """
+
+    def __init__(self, input_dim: int, image_shape: tuple[int, int, int], depth: int, layers: int) -> None:
+        super().__init__()
+        channels, height, width = image_shape
+        layers = cnn_layer_count(height, width, layers)
+        widths = [depth * min(2**layer, 8) for layer in reversed(range(layers))]
+        self.feature_map = (widths[0], height // 2**layers, width // 2**layers)
+        self.linear = nn.Linear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2])
+        modules: list[nn.Module] = []
+        for narrow, wide in zip([*widths[1:], channels], widths, strict=True):
+            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU()]
+        self.convolutions = nn.Sequential(*modules[:-1]).to(memory_format=torch.channels_last)
+
+    def forward(self, feat: torch.Tensor) -> torch.Tensor:
+        features = self.linear(feat).unflatten(1, self.feature_map)
+        return self.convolutions(features.contiguous(memory_format=torch.channels_last))
+
+
+class Encoder(nn.Module):
+    """
+    Observations to one embedding: images through the CNN, vectors through an MLP, side by side.
+
+    :param spec: the observations
+    :param depth: of the CNN
+    :param layers: of the CNN
+    :param vector_layers: hidden layers of the MLP
+    :param vector_units: size of each of them
+    """
+
+    def __init__(self, spec: ObservationSpec, depth: int, layers: int, vector_layers: int, vector_units: int) -> None:
+        super().__init__()
+        self.cnn = None if spec.image_shape is None else ConvEncoder(spec.image_shape, depth, layers)
+        self.mlp = None if spec.vector_dim == 0 else MLP(spec.vector_dim, vector_layers, vector_units)
+        self.output_dim = sum(part.output_dim for part in (self.cnn, self.mlp) if part is not None)
+
+    def forward(self, inputs: Inputs) -> torch.Tensor:
+        parts = []
+        if self.cnn is not None:
+            parts.append(self.cnn(inputs.images))
+        if self.mlp is not None:
+            parts.append(self.mlp(inputs.vectors))
+        return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+
+
+class Decoder(nn.Module):
+    """
+    Latents back to observations, in the form of :class:`Inputs`.
+
+    :param feat_dim: size of the latent
+    :param spec: the observations
+    :param depth: of the CNN
+    :param layers: of the CNN
+    :param vector_layers: hidden layers of the MLP
+    :param vector_units: size of each of them
+    """
+
+    def __init__(
+        self, feat_dim: int, spec: ObservationSpec, depth: int, layers: int, vector_layers: int, vector_units: int
+    ) -> None:
+        super().__init__()
+        self.cnn = None if spec.image_shape is None else ConvDecoder(feat_dim, spec.image_shape, depth, layers)
+        self.mlp = None if spec.vector_dim == 0 else MLP(feat_dim, vector_layers, vector_units, spec.vector_dim)
+
+    def forward(self, feat: torch.Tensor) -> Inputs:
+        return Inputs(
+            images=None if self.cnn is None else self.cnn(feat), vectors=None if self.mlp is None else self.mlp(feat)
+        )

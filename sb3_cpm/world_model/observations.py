@@ -1,0 +1,185 @@
+"""
+What of a Dict observation space the world model reads, and how it enters the networks (report, section 4.1 and B.1).
+
+Images are stacked on their channels and scaled to [-0.5, 0.5]; vectors are concatenated and squashed with ``symlog``.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from gymnasium import spaces
+
+MIN_FEATURE_MAP = 2  # the smallest feature map of the CNN, pixels per side
+
+
+def symlog(x: torch.Tensor) -> torch.Tensor:
+    """Logarithm that keeps sign and small values (Hafner et al. 2023, eq. 9): the range of a vector is rarely known."""
+    return torch.sign(x) * torch.log1p(torch.abs(x))
+
+
+def symexp(x: torch.Tensor) -> torch.Tensor:
+    """Inverse of ``symlog``."""
+    return torch.sign(x) * torch.expm1(torch.abs(x))
+
+
+class Inputs(NamedTuple):
+    """
+    Preprocessed observations of ``n`` states.
+
+    :param images: all cameras on the channels, in [-0.5, 0.5], shape ``(n, channels, height, width)``, or None
+    :param vectors: all vectors side by side, shape ``(n, vector_dim)``, or None
+    """
+
+    images: torch.Tensor | None
+    vectors: torch.Tensor | None
+
+
+class ObservationSpec:
+    """
+    The observation keys that the world model reads, sorted by kind.
+
+    An *image* is a 3-D uint8 Box, channel-last ``(H, W, C)`` or channel-first ``(C, H, W)`` (the channels are the
+    smallest dimension, as in SB3); a *vector* is a 1-D Box. A point cloud (2-D float Box) is read only when ``keys``
+    names it; it is then flattened to one long vector.
+
+    :param observation_space: Dict space as SB3's VecEnv gives it
+    :param keys: the keys to read; all images and vectors by default
+    :param squash: squash vectors with ``symlog``
+    :raises ValueError: for a space that is not a Dict, unknown or unusable keys, images of unequal size
+    """
+
+    def __init__(self, observation_space: spaces.Dict, keys: Sequence[str] | None = None, squash: bool = True) -> None:
+        if not isinstance(observation_space, spaces.Dict):
+            raise ValueError(
+                f"The challenger needs a Dict observation space, got {observation_space}. Wrap the environment, for "
+                "example with gymnasium.wrappers.TransformObservation or a wrapper that returns {'state': observation}."
+            )
+        self.squash = squash
+        chosen = self._choose(observation_space, keys)
+        self.image_keys = tuple(key for key in chosen if is_image(observation_space[key]))
+        self.vector_keys = tuple(key for key in chosen if key not in self.image_keys)
+        self.keys = self.image_keys + self.vector_keys
+        self.shapes: dict[str, tuple[int, ...]] = {key: tuple(observation_space[key].shape or ()) for key in self.keys}
+        self.image_shape = self._image_shape()
+        self.vector_sizes = [int(np.prod(self.shapes[key])) for key in self.vector_keys]
+        self.vector_dim = sum(self.vector_sizes)
+
+    @staticmethod
+    def _choose(space: spaces.Dict, keys: Sequence[str] | None) -> list[str]:
+        if keys is None:
+            chosen = [key for key, sub in space.items() if is_image(sub) or is_vector(sub)]
+            if not chosen:
+                raise ValueError(
+                    "No observation key is usable by the challenger: it reads images (3-D uint8 Box) and vectors (1-D "
+                    f"Box), the space has { {key: str(sub) for key, sub in space.items()} }. A point cloud is read if "
+                    "`keys` names it."
+                )
+            return chosen
+        if isinstance(keys, str) or not keys:
+            raise ValueError(f"`keys` must be a non-empty list of observation keys, got {keys!r}.")
+        for key in keys:
+            if key not in space.spaces:
+                raise ValueError(f"Unknown observation key {key!r}, the space has {sorted(space.spaces)}.")
+            if not (is_image(space[key]) or is_vector(space[key]) or is_cloud(space[key])):
+                raise ValueError(
+                    f"The challenger cannot read key {key!r}: {space[key]} is no image (3-D uint8 Box), no vector (1-D Box) "
+                    "and no point cloud (2-D float Box). Leave it out of `keys`."
+                )
+        return list(dict.fromkeys(keys))
+
+    def _image_shape(self) -> tuple[int, int, int] | None:
+        if not self.image_keys:
+            return None
+        sizes = {key: self._height_width(key) for key in self.image_keys}
+        if len(set(sizes.values())) > 1:
+            listing = ", ".join(f"{key}: {height}x{width}" for key, (height, width) in sizes.items())
+            raise ValueError(
+                f"Images of unequal size cannot be stacked ({listing}). Render all cameras at one size, or pass `keys` "
+                "with cameras of one size only."
+            )
+        self.channels = [min(self.shapes[key]) for key in self.image_keys]
+        height, width = sizes[self.image_keys[0]]
+        return sum(self.channels), height, width
+
+    def _channel_first(self, key: str) -> bool:
+        shape = self.shapes[key]
+        return int(np.argmin(shape)) == 0 and shape[0] != shape[-1]
+
+    def _height_width(self, key: str) -> tuple[int, int]:
+        shape = self.shapes[key]
+        return (shape[1], shape[2]) if self._channel_first(key) else (shape[0], shape[1])
+
+    def preprocess(self, observations: Mapping[str, np.ndarray | torch.Tensor], device: torch.device) -> Inputs:
+        """
+        Raw observations to network inputs; the arrays that come in are not touched.
+
+        :param observations: each of shape ``(*batch, *observation_shape)``; all batch dimensions are flattened
+        :param device: where the inputs shall live
+        :return: inputs of ``prod(batch)`` states
+        :raises ValueError: for a missing key or an array of another shape than the space's
+        """
+        tensors = {key: self._flat_batch(key, observations, device) for key in self.keys}
+        images = vectors = None
+        if self.image_keys:
+            # (n, H, W, C) all along: seen as (n, C, H, W) that is PyTorch's channels-last format, fast in convolutions
+            stacked = [
+                tensors[key].permute(0, 2, 3, 1) if self._channel_first(key) else tensors[key] for key in self.image_keys
+            ]
+            joined = torch.cat(stacked, dim=-1) if len(stacked) > 1 else stacked[0].contiguous()
+            images = joined.permute(0, 3, 1, 2).float().div_(255.0).sub_(0.5)
+        if self.vector_keys:
+            vectors = torch.cat([tensors[key].flatten(1).float() for key in self.vector_keys], dim=-1)
+            if self.squash:
+                vectors = symlog(vectors)
+        return Inputs(images, vectors)
+
+    def _flat_batch(
+        self, key: str, observations: Mapping[str, np.ndarray | torch.Tensor], device: torch.device
+    ) -> torch.Tensor:
+        if key not in observations:
+            raise ValueError(f"Observation key {key!r} is missing, got {sorted(observations)}.")
+        tensor = torch.as_tensor(observations[key], device=device)
+        shape = self.shapes[key]
+        if tuple(tensor.shape[-len(shape) :]) != shape:
+            raise ValueError(
+                f"Observation {key!r} has shape {tuple(tensor.shape)}, expected it to end in {shape}: the observation space "
+                "is not the one that the challenger was built for."
+            )
+        return tensor.reshape(-1, *shape)
+
+    def split(self, inputs: Inputs, batch: Sequence[int]) -> dict[str, torch.Tensor]:
+        """
+        The inverse of :meth:`preprocess`, for decoded observations: one float tensor per key, images in [0, 255].
+
+        :param inputs: preprocessed (or decoded) observations of ``prod(batch)`` states
+        :param batch: the batch dimensions to restore
+        :return: tensors of shape ``(*batch, *observation_shape)``
+        """
+        result = {}
+        if inputs.images is not None:
+            cameras = torch.split((inputs.images + 0.5).clamp(0.0, 1.0) * 255.0, self.channels, dim=1)
+            for key, camera in zip(self.image_keys, cameras, strict=True):
+                camera = camera if self._channel_first(key) else camera.permute(0, 2, 3, 1)
+                result[key] = camera.reshape(*batch, *self.shapes[key])
+        if inputs.vectors is not None:
+            vectors = symexp(inputs.vectors) if self.squash else inputs.vectors
+            for key, vector in zip(self.vector_keys, torch.split(vectors, self.vector_sizes, dim=-1), strict=True):
+                result[key] = vector.reshape(*batch, *self.shapes[key])
+        return result
+
+
+def is_image(space: spaces.Space) -> bool:
+    """3-D uint8 Box."""
+    return isinstance(space, spaces.Box) and len(space.shape) == 3 and space.dtype == np.uint8
+
+
+def is_vector(space: spaces.Space) -> bool:
+    """1-D Box."""
+    return isinstance(space, spaces.Box) and len(space.shape) == 1
+
+
+def is_cloud(space: spaces.Space) -> bool:
+    """2-D float Box, (points, features)."""
+    return isinstance(space, spaces.Box) and len(space.shape) == 2 and np.issubdtype(space.dtype, np.floating)

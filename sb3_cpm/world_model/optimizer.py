@@ -1,0 +1,70 @@
+"""Adam with what Dreamer adds to it: gradient clipping, decoupled weight decay, and a refusal to step on NaN."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import nn
+
+
+class Optimizer:
+    """
+    :param name: how errors and logs call it
+    :param modules: whose parameters to train; parameters without gradients (slow targets) are left out
+    :param learning_rate: of Adam
+    :param eps: of Adam
+    :param clip: greatest norm of the whole gradient
+    :param weight_decay: share of every weight that a step takes away, independent of the learning rate; biases and gains
+        of layer norms keep theirs
+    """
+
+    def __init__(
+        self,
+        name: str,
+        modules: Iterable[nn.Module],
+        learning_rate: float,
+        eps: float = 1e-5,
+        clip: float = 100.0,
+        weight_decay: float = 1e-6,
+    ) -> None:
+        named = [item for module in modules for item in module.named_parameters() if item[1].requires_grad]
+        self.name, self.clip, self.weight_decay = name, clip, weight_decay
+        self.parameters = [parameter for _, parameter in named]
+        self.decayed = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
+        self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
+
+    def step(self, loss: torch.Tensor) -> torch.Tensor:
+        """
+        One update, for this optimizer's parameters only: no gradient is left at, or computed for, any other.
+
+        :param loss: scalar
+        :return: the gradient's norm before clipping
+        :raises RuntimeError: if loss or gradient are not finite; the parameters are then still the good ones
+        """
+        if not torch.isfinite(loss):
+            raise RuntimeError(f"The {self.name} loss became {loss.item()}. {ADVICE}")
+        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
+        if not torch.isfinite(norm):
+            self.adam.zero_grad(set_to_none=True)
+            raise RuntimeError(f"The gradient of the {self.name} loss ({loss.item():.4g}) became {norm.item()}. {ADVICE}")
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+        if self.weight_decay and self.decayed:
+            with torch.no_grad():
+                torch._foreach_mul_(self.decayed, 1.0 - self.weight_decay)
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.adam.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.adam.load_state_dict(state)
+
+
+ADVICE = (
+    "No weight was changed by this update. Look for NaN or very large values in observations and rewards; a lower learning "
+    "rate or a smaller `grad_clip` helps where the data are sound."
+)

@@ -1,0 +1,150 @@
+"""
+The recurrent state-space model (report, B.1; Hafner et al. 2021, section 2): deterministic memory and stochastic state.
+
+========= =====================================================
+deter_t   GRU(deter_{t-1}, stoch_{t-1}, action_t)
+prior     p(stoch_t | deter_t), what was predicted
+posterior q(stoch_t | deter_t, embed_t), after seeing state t
+========= =====================================================
+
+``action_t`` is the action that *led to* state t (see :class:`sb3_cpm.type_aliases.SequenceBatch`). Only what depends on the
+step before is computed step by step; projections of embeddings and actions, and the whole prior, see all steps at once.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_cpm.world_model.distributions import Latent
+from sb3_cpm.world_model.networks import GRUCell
+
+
+class LatentState(NamedTuple):
+    """
+    What the world model believes about one state, for any batch dimensions.
+
+    :param deter: deterministic part, shape ``(*batch, deter_size)``
+    :param stoch: stochastic part, shape ``(*batch, stoch_size)``
+    :param stats: parameters of the distribution that ``stoch`` was drawn from, shape ``(*batch, stats_size)``
+    """
+
+    deter: torch.Tensor
+    stoch: torch.Tensor
+    stats: torch.Tensor
+
+    @property
+    def feat(self) -> torch.Tensor:
+        """The whole latent, what heads and actors read, shape ``(*batch, feat_dim)``."""
+        return torch.cat((self.stoch, self.deter), dim=-1)
+
+    def detach(self) -> "LatentState":
+        return LatentState(*(part.detach() for part in self))
+
+    def flatten(self) -> "LatentState":
+        """All batch dimensions in one."""
+        return LatentState(*(part.flatten(0, -2) for part in self))
+
+    def select(self, index: torch.Tensor) -> "LatentState":
+        """Rows of the first batch dimension."""
+        return LatentState(*(part[index] for part in self))
+
+
+class RSSM(nn.Module):
+    """
+    :param latent: kind of the stochastic state
+    :param deter_size: size of the GRU (200 in the report)
+    :param hidden_size: size of the layers around the GRU
+    :param embed_dim: size of the encoder's output
+    :param action_dim: number of action dimensions
+    """
+
+    def __init__(self, latent: Latent, deter_size: int, hidden_size: int, embed_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.latent = latent
+        self.deter_size = deter_size
+        self.feat_dim = latent.size + deter_size
+        self.input_stoch = nn.Linear(latent.size, hidden_size)
+        self.input_action = nn.Linear(action_dim, hidden_size, bias=False)
+        self.gru = GRUCell(hidden_size, deter_size)
+        self.prior_net = nn.Sequential(
+            nn.Linear(deter_size, hidden_size), nn.ELU(), nn.Linear(hidden_size, latent.stats_size)
+        )
+        self.posterior_deter = nn.Linear(deter_size, hidden_size)
+        self.posterior_embed = nn.Linear(embed_dim, hidden_size, bias=False)
+        self.posterior_out = nn.Linear(hidden_size, latent.stats_size)
+
+    def initial_state(self, n: int) -> LatentState:
+        """Zeros for ``n`` environments."""
+        like = self.input_stoch.weight
+        sizes = (self.deter_size, self.latent.size, self.latent.stats_size)
+        return LatentState(*(torch.zeros(n, size, device=like.device, dtype=like.dtype) for size in sizes))
+
+    def observe(
+        self,
+        embed: torch.Tensor,
+        actions: torch.Tensor,
+        is_first: torch.Tensor,
+        mask: torch.Tensor | None = None,
+        state: LatentState | None = None,
+        deterministic: bool = False,
+    ) -> LatentState:
+        """
+        Posterior states along sequences of ``L`` rows and ``n`` columns.
+
+        Where ``is_first`` is set, nothing from before enters: memory and action are zero there. Where ``mask`` is False,
+        the column's state stays as it is.
+
+        :param embed: encoder outputs, shape ``(L, n, embed_dim)``
+        :param actions: the action that led to each row, shape ``(L, n, action_dim)``
+        :param is_first: first row of an episode, shape ``(L, n)``, bool
+        :param mask: rows that exist, shape ``(L, n)``, bool; None where all do (or where the caller masks the results)
+        :param state: the state before the first row; zeros by default
+        :param deterministic: take the mode instead of a sample
+        :return: posteriors of all rows, batch dimensions ``(L, n)``
+        """
+        length, n = is_first.shape
+        state = self.initial_state(n) if state is None else state
+        first = is_first.unsqueeze(-1)
+        actions_in = self.input_action(actions.masked_fill(first, 0.0))
+        embed_in = self.posterior_embed(embed)
+        noise = None if deterministic else self.latent.noise(length, n, like=embed_in)
+        resets = is_first.any(dim=1).tolist()
+        gaps = None if mask is None else (~mask).any(dim=1).tolist()
+
+        deter, stoch, stats = state
+        rows: list[LatentState] = []
+        for t in range(length):
+            before = LatentState(deter, stoch, stats)
+            if resets[t]:
+                deter, stoch = deter.masked_fill(first[t], 0.0), stoch.masked_fill(first[t], 0.0)
+            deter = self.gru(F.elu(self.input_stoch(stoch) + actions_in[t]), deter)
+            stats = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_in[t]))
+            stoch = self.latent.mode(stats) if noise is None else self.latent.sample(stats, noise[t])
+            if mask is not None and gaps is not None and gaps[t]:
+                here = mask[t].unsqueeze(-1)
+                deter, stoch, stats = (
+                    torch.where(here, new, old) for new, old in zip((deter, stoch, stats), before, strict=True)
+                )
+            rows.append(LatentState(deter, stoch, stats))
+        return LatentState(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
+
+    def prior(self, deter: torch.Tensor) -> torch.Tensor:
+        """Parameters of the prior that belongs to a deterministic state, shape ``(*batch, stats_size)``."""
+        return self.prior_net(deter)
+
+    def imagine_step(self, state: LatentState, action: torch.Tensor, deterministic: bool = False) -> LatentState:
+        """
+        One step without an observation.
+
+        :param state: latent state, batch dimension ``(n,)``
+        :param action: the action taken in it, shape ``(n, action_dim)``
+        :param deterministic: take the mode instead of a sample
+        :return: the predicted next state
+        """
+        deter = self.gru(F.elu(self.input_stoch(state.stoch) + self.input_action(action)), state.deter)
+        stats = self.prior_net(deter)
+        if deterministic:
+            return LatentState(deter, self.latent.mode(stats), stats)
+        return LatentState(deter, self.latent.sample(stats, self.latent.noise(len(deter), like=deter)), stats)

@@ -1,0 +1,168 @@
+"""
+The world model: encoder, RSSM, decoders, reward head and continue head, trained together (report, B.1; Hafner et al. 2021).
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent, Latent
+from sb3_cpm.world_model.losses import balanced_kl, masked_mean, squared_error
+from sb3_cpm.world_model.networks import MLP, Decoder, Encoder, initialize
+from sb3_cpm.world_model.observations import Inputs, ObservationSpec, symexp, symlog
+from sb3_cpm.world_model.rssm import RSSM, LatentState
+
+
+class Sequences(NamedTuple):
+    """
+    A :class:`~sb3_cpm.type_aliases.SequenceBatch` on the device; ``inputs`` has its ``L * n`` rows flattened.
+
+    :param inputs: preprocessed observations of all rows
+    :param actions: shape ``(L, n, action_dim)``
+    :param rewards: shape ``(L, n)``
+    :param is_first: shape ``(L, n)``, bool
+    :param is_terminal: shape ``(L, n)``, bool
+    :param mask: shape ``(L, n)``, bool
+    """
+
+    inputs: Inputs
+    actions: torch.Tensor
+    rewards: torch.Tensor
+    is_first: torch.Tensor
+    is_terminal: torch.Tensor
+    mask: torch.Tensor
+
+
+class WorldModelOutput(NamedTuple):
+    """
+    :param losses: the terms of the loss, already multiplied by their scale; their sum is what is minimised
+    :param metrics: further numbers worth logging, detached scalars
+    :param posterior: posterior states of all rows, batch dimensions ``(L, n)``, detached
+    :param embed: encoder outputs of all rows, shape ``(L, n, embed_dim)``, detached
+    """
+
+    losses: dict[str, torch.Tensor]
+    metrics: dict[str, torch.Tensor]
+    posterior: LatentState
+    embed: torch.Tensor
+
+
+def make_latent(preset: Mapping[str, Any]) -> Latent:
+    """The kind of stochastic state that a preset asks for."""
+    if preset["latent"] == "gaussian":
+        return GaussianLatent(preset["stoch_size"])
+    if preset["latent"] == "categorical":
+        return CategoricalLatent(preset["stoch_size"], preset["stoch_classes"])
+    raise ValueError(f"`latent` must be 'gaussian' or 'categorical', got {preset['latent']!r}.")
+
+
+class WorldModel(nn.Module):
+    """
+    :param spec: the observations that it reads
+    :param action_dim: number of action dimensions
+    :param preset: sizes and scales, see :mod:`sb3_cpm.presets`
+    """
+
+    def __init__(self, spec: ObservationSpec, action_dim: int, preset: Mapping[str, Any]) -> None:
+        super().__init__()
+        self.spec, self.preset = spec, preset
+        vector = (preset["vector_layers"], preset["vector_units"])
+        cnn = (preset["cnn_depth"], preset["cnn_layers"])
+        self.encoder = Encoder(spec, *cnn, *vector)
+        self.embed_dim = self.encoder.output_dim
+        self.latent = make_latent(preset)
+        self.rssm = RSSM(self.latent, preset["deter_size"], preset["hidden_size"], self.embed_dim, action_dim)
+        self.feat_dim = self.rssm.feat_dim
+        self.decoder = Decoder(self.feat_dim, spec, *cnn, *vector)
+        head = (self.feat_dim, preset["head_layers"], preset["head_units"], 1)
+        self.reward_head = MLP(*head)
+        self.continue_head = MLP(*head) if preset["continue_head"] else None
+        self.apply(initialize)
+
+    def loss(self, batch: Sequences) -> WorldModelOutput:
+        """Everything that one update of the world model minimises, and the posterior states it found on the way."""
+        length, n = batch.mask.shape
+        embed = self.encoder(batch.inputs).unflatten(0, (length, n))
+        # no mask here: padding follows the last row, so it cannot change a state that counts
+        posterior = self.rssm.observe(embed, batch.actions, batch.is_first)
+        prior = self.rssm.prior(posterior.deter)
+        feat = posterior.feat
+        kl = balanced_kl(
+            self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"]
+        )
+        losses = {"kl": self.preset["kl_scale"] * kl}
+        metrics = {}
+        reconstructions, errors = self._reconstruction_losses(feat, batch)
+        losses.update(reconstructions)
+        metrics.update(errors)
+        losses.update(self._head_losses(feat, batch))
+        with torch.no_grad():
+            metrics["kl"] = masked_mean(self.latent.kl(posterior.stats, prior), batch.mask)
+        return WorldModelOutput(losses, metrics, posterior.detach(), embed.detach())
+
+    def _reconstruction_losses(
+        self, feat: torch.Tensor, batch: Sequences
+    ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        losses, metrics = {}, {}
+        decoded = self.decoder(feat.flatten(0, 1))
+        mask = batch.mask.flatten()
+        if decoded.images is not None and batch.inputs.images is not None:
+            losses["image"] = masked_mean(squared_error(decoded.images, batch.inputs.images), mask)
+            with torch.no_grad():  # the report's measure of Fig. 10b, on the scale of [-0.5, 0.5]
+                error = (decoded.images - batch.inputs.images).abs().mean((1, 2, 3))
+                metrics["pixel_error"] = masked_mean(error, mask)
+        if decoded.vectors is not None and batch.inputs.vectors is not None:
+            losses["vector"] = masked_mean(squared_error(decoded.vectors, batch.inputs.vectors), mask)
+        return losses, metrics
+
+    def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> dict[str, torch.Tensor]:
+        feat_reward = feat if self.preset["reward_gradient"] else feat.detach()
+        target = symlog(batch.rewards) if self.preset["symlog_rewards"] else batch.rewards
+        error = squared_error(self.reward_head(feat_reward).squeeze(-1).flatten(), target.flatten())
+        # nothing was received for arriving in a reset state; its stored 0 is no observation of the reward function
+        arrived = (batch.mask & ~batch.is_first).flatten()
+        losses = {"reward": self.preset["reward_scale"] * masked_mean(error, arrived)}
+        if self.continue_head is not None:
+            logits = self.continue_head(feat).squeeze(-1)
+            goes_on = (~batch.is_terminal).to(logits.dtype)
+            entropy = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="none")
+            losses["continue"] = self.preset["continue_scale"] * masked_mean(entropy, batch.mask)
+        return losses
+
+    def reward(self, feat: torch.Tensor) -> torch.Tensor:
+        """Predicted reward for arriving in a state, shape ``(*batch,)``."""
+        prediction = self.reward_head(feat).squeeze(-1)
+        return symexp(prediction) if self.preset["symlog_rewards"] else prediction
+
+    def continue_probability(self, feat: torch.Tensor) -> torch.Tensor:
+        """Predicted probability that the episode does not terminate in a state, shape ``(*batch,)``."""
+        if self.continue_head is None:
+            return torch.ones_like(feat[..., 0])
+        return torch.sigmoid(self.continue_head(feat).squeeze(-1))
+
+    def kl(self, state: LatentState) -> torch.Tensor:
+        """
+        KL(posterior || prior) of every state: per step, unbalanced, before free nats. The report's KL-LOSS in u_t.
+
+        :param state: posterior states
+        :return: nats, shape ``(*batch,)``
+        """
+        return self.latent.kl(state.stats, self.rssm.prior(state.deter))
+
+    def open_loop(self, state: LatentState, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        """
+        What the model expects to see if ``actions`` were executed, without looking (modes only, no random numbers).
+
+        :param state: the state to start in, batch dimension ``(n,)``
+        :param actions: shape ``(H, n, action_dim)``
+        :return: decoded observations of the ``H`` states that follow, per key of shape ``(H, n, *observation_shape)``
+        """
+        feats = []
+        for action in actions:
+            state = self.rssm.imagine_step(state, action, deterministic=True)
+            feats.append(state.feat)
+        feat = torch.stack(feats)
+        return self.spec.split(self.decoder(feat.flatten(0, 1)), feat.shape[:2])
