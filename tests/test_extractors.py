@@ -1,0 +1,196 @@
+"""PointNet: invariance, identity at the start, gradients, and what the player's networks never see."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import preprocess_obs
+
+from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.extractors import PointNet, PointNetExtractor, PointNetPolicy
+
+SPACE = spaces.Dict(
+    {
+        "camera": spaces.Box(0, 255, (3, 32, 32), np.uint8),
+        "pointcloud": spaces.Box(-2, 2, (40, 6), np.float32),
+        "state": spaces.Box(-1, 1, (5,), np.float32),
+    }
+)
+
+
+def batch(n: int = 4) -> dict[str, th.Tensor]:
+    return {"pointcloud": th.randn(n, 40, 6), "state": th.randn(n, 5)}
+
+
+@pytest.mark.parametrize("input_transform", [False, True])
+def test_order_of_points_does_not_matter(input_transform: bool) -> None:
+    extractor = PointNetExtractor(SPACE, input_transform=input_transform)
+    observations = batch()
+    shuffled = {**observations, "pointcloud": observations["pointcloud"][:, th.randperm(40)]}
+    assert th.allclose(extractor(observations), extractor(shuffled), atol=1e-6)
+
+
+def test_equals_the_plain_formula_with_and_without_gradient() -> None:
+    """Critical points are a shortcut: values and gradients are those of relu(max(MLP))."""
+    net = PointNet(6, (8, 16))
+    points = th.randn(3, 40, 6, requires_grad=True)
+    plain = th.relu(net.last(net.shared(points)).amax(dim=1))
+    expected = th.autograd.grad(plain.square().sum(), [points, *net.parameters()])
+    result = net(points)
+    found = th.autograd.grad(result.square().sum(), [points, *net.parameters()])
+    assert th.allclose(result, plain, atol=1e-6)
+    for one, other in zip(found, expected, strict=True):
+        assert th.allclose(one, other, atol=1e-5)
+    with th.no_grad():
+        assert th.allclose(net(points), plain, atol=1e-6)
+
+
+def test_input_transform_starts_as_identity_and_learns() -> None:
+    net = PointNet(6, (8, 16), input_transform=True)
+    assert net.transform is not None
+    points = th.randn(3, 40, 6)
+    assert th.allclose(net.transform(points[..., :3]), th.eye(3).expand(3, 3, 3))
+    net(points).sum().backward()
+    assert net.transform.matrix.weight.grad is not None
+    assert net.transform.matrix.weight.grad.abs().sum() > 0
+
+
+def test_one_layer_and_no_vector() -> None:
+    extractor = PointNetExtractor(spaces.Dict({"cloud": SPACE["pointcloud"]}), sizes=(7,))
+    assert extractor({"cloud": th.randn(2, 40, 6)}).shape == (2, extractor.features_dim) == (2, 7)
+
+
+def test_size_state_arch_and_keys() -> None:
+    extractor = PointNetExtractor(SPACE, sizes=(8, 16), state_arch=(12,))
+    assert extractor.features_dim == 16 + 12
+    assert extractor.player_keys == ("pointcloud", "state")
+    assert extractor(batch()).shape == (4, 28)
+    with_image = PointNetExtractor(SPACE, keys=["state", "camera"], image_size=10)
+    assert with_image.player_keys == ("camera", "state")
+    assert with_image({"camera": th.rand(2, 3, 32, 32), "state": th.rand(2, 5)}).shape == (2, 15)
+
+
+def test_channels_last_images_can_be_read() -> None:
+    """Images of two stacked cameras keep their channels last, SB3 transposes only what it recognises."""
+    space = spaces.Dict({"cameras": spaces.Box(0, 255, (32, 32, 6), np.uint8)})
+    extractor = PointNetExtractor(space, keys=["cameras"])
+    assert extractor({"cameras": th.rand(2, 32, 32, 6)}).shape == (2, 64)
+
+
+def test_every_parameter_gets_a_gradient() -> None:
+    extractor = PointNetExtractor(SPACE, input_transform=True, state_arch=(8,))
+    transform = extractor.clouds[0].transform
+    th.nn.init.normal_(transform.matrix.weight, std=0.1)  # while it is zero, nothing below it can learn
+    extractor(batch(16)).square().sum().backward()
+    for name, parameter in extractor.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_float16_clouds_through_preprocessing() -> None:
+    extractor = PointNetExtractor(SPACE)
+    observations = batch()
+    half = {"pointcloud": observations["pointcloud"].half(), "state": observations["state"]}
+    exact = {**observations, "pointcloud": half["pointcloud"].float()}
+    assert th.equal(extractor(preprocess_obs(half, SPACE)), extractor(exact))
+    assert th.equal(extractor(half), extractor(exact))
+
+
+@pytest.mark.parametrize(
+    ("space", "kwargs", "message"),
+    [
+        (SPACE["state"], {}, "DictObservation"),
+        (spaces.Dict({"camera": SPACE["camera"]}), {}, "neither a point cloud"),
+        (SPACE, {"keys": ["lidar"]}, "lidar"),
+        (SPACE, {"keys": []}, "neither a point cloud"),
+        (spaces.Dict({"button": spaces.Discrete(3)}), {"keys": ["button"]}, "clouds, vectors and images"),
+        (SPACE, {"sizes": (0,)}, "at least one layer"),
+        (spaces.Dict({"flat": spaces.Box(-1, 1, (9, 2), np.float32)}), {"input_transform": True}, "x, y, z"),
+    ],
+)
+def test_wrong_input(space: Any, kwargs: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PointNetExtractor(space, **kwargs)
+
+
+class _Untouchable(np.ndarray):
+    """Pixels that nobody may convert, copy or move."""
+
+    def __deepcopy__(self, memo: dict) -> "_Untouchable":
+        raise AssertionError("the policy touched the camera")
+
+    def __array__(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        raise AssertionError("the policy touched the camera")
+
+
+def test_policy_never_touches_images(tmp_path: Path) -> None:
+    model = SAC(PointNetPolicy, ToyEnv(), buffer_size=100, learning_starts=10, batch_size=8, device="cpu")
+    model.learn(15)
+    observation, _ = ToyEnv().reset(seed=0)
+    expected, _ = model.predict(observation, deterministic=True)
+    observation["camera"] = np.moveaxis(observation["camera"], -1, 0).view(_Untouchable)
+    action, _ = model.predict(observation, deterministic=True)
+    assert np.array_equal(action, expected)
+    tensors, _ = model.policy.obs_to_tensor(observation)
+    assert set(tensors) == {"pointcloud", "state"}
+
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", device="cpu")
+    assert np.array_equal(loaded.predict(observation, deterministic=True)[0], expected)
+
+
+def test_trains_on_batches_without_images() -> None:
+    """CPMBuffer leaves the images out of the batches for the player."""
+    model = SAC(PointNetPolicy, ToyEnv(), buffer_size=100, learning_starts=10, batch_size=8, device="cpu")
+    model.learn(15)
+    sample = model.replay_buffer.sample
+
+    def without_camera(*args: Any, **kwargs: Any) -> Any:
+        data = sample(*args, **kwargs)
+        for observations in (data.observations, data.next_observations):
+            del observations["camera"]
+        return data
+
+    model.replay_buffer.sample = without_camera
+    before = model.policy.parameters_to_vector()
+    model.train(2, batch_size=8)
+    assert not np.allclose(before, model.policy.parameters_to_vector())
+
+
+def test_thrifty_critic_trains_like_that_of_sb3(monkeypatch: pytest.MonkeyPatch) -> None:
+    def parameters_after_training() -> np.ndarray:
+        model = SAC(PointNetPolicy, ToyEnv(), buffer_size=100, learning_starts=10, batch_size=8, seed=1, device="cpu")
+        model.learn(20)
+        return model.policy.parameters_to_vector()
+
+    thrifty = parameters_after_training()
+    monkeypatch.setattr("sb3_cpm.extractors._ThriftyCritic", ContinuousCritic)
+    assert np.allclose(thrifty, parameters_after_training(), atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", [TD3, TQC])
+def test_with_other_players(algorithm: type) -> None:
+    policy_kwargs = {"features_extractor_class": PointNetExtractor}
+    model = algorithm(
+        "MultiInputPolicy", ToyEnv(), buffer_size=100, learning_starts=10, batch_size=8, policy_kwargs=policy_kwargs
+    )
+    model.learn(15)
+
+
+def test_extractor_is_fast_enough() -> None:
+    """An update of SAC (batch 64, 350 points) takes about 57 ms on one core; the bound leaves room for a busy machine."""
+    space = spaces.Dict({"cloud": spaces.Box(-2, 2, (350, 6), np.float32), "state": spaces.Box(-1, 1, (29,), np.float32)})
+    extractor = PointNetExtractor(space)
+    observations = {"cloud": th.randn(64, 350, 6), "state": th.randn(64, 29)}
+    extractor(observations).sum().backward()
+    start = time.process_time()
+    for _ in range(5):
+        extractor(observations).sum().backward()
+    assert (time.process_time() - start) / 5 < 0.06
