@@ -78,7 +78,7 @@ DEFAULT: dict[str, Any] = {
     "actor_lr": 3e-4,
     "critic_lr": 3e-4,
     "uncertainty_lr": 1e-3,
-    "imagination_starts": 128,
+    "imagination_starts": 64,
     "actor_layers": 2,
     "actor_units": 128,
     "critic_layers": 2,
