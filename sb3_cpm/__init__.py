@@ -21,7 +21,10 @@ Algorithm 1 of the report, with the place where each line lives::
 
 from pathlib import Path
 
+from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
-__all__ = ["__version__"]
+__all__ = ["CPMBuffer", "ChallengerCallback", "PointNetExtractor", "PointNetPolicy", "__version__"]

@@ -309,8 +309,9 @@ class CPMBuffer(HerReplayBuffer):
         """
         if not self.episodes_ended:
             raise RuntimeError(
-                "Unable to sample before the end of the first episode: set learning_starts to more than n_envs x the longest "
-                f"episode (at {self.n_added} transitions no episode has ended), or limit the episodes."
+                f"Unable to sample: there is no complete episode among the last {self.size() * self.n_envs} transitions. Set "
+                "learning_starts to more than n_envs x the longest episode, buffer_size to more than twice that, or limit the "
+                "episodes (gymnasium.wrappers.TimeLimit)."
             )
         with self._section():
             n_imaginary = self._n_imaginary_rows(batch_size)

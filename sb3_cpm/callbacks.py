@@ -359,19 +359,21 @@ def _check_model(model: Any) -> None:
 
 def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
     """P can only sample once an episode has ended; say so now instead of in the middle of the run."""
-    assert model.env is not None
-    if not model.replay_buffer.episodes_ended and (longest := _max_episode_steps(model.env)) is not None:  # type: ignore[union-attr]
-        needed = longest * model.n_envs
-        if model.learning_starts < needed and model.buffer_size >= needed:
-            raise ValueError(
-                f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps in "
-                f"each of {model.n_envs} environments. Set learning_starts={needed} or more."
-            )
-        if model.buffer_size < needed:
-            raise ValueError(
-                f"buffer_size={model.buffer_size} is too small for one episode of {longest} steps in each of {model.n_envs} "
-                f"environments. Set buffer_size={needed} or more."
-            )
+    assert model.env is not None and isinstance(model.replay_buffer, CPMBuffer)
+    longest = _max_episode_steps(model.env)
+    if longest is None or model.replay_buffer.episodes_ended:
+        return
+    needed = longest * model.n_envs
+    if model.learning_starts < needed:
+        raise ValueError(
+            f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps in "
+            f"each of {model.n_envs} environments. Set learning_starts={needed} or more."
+        )
+    if model.buffer_size < 2 * needed:
+        raise ValueError(
+            f"buffer_size={model.buffer_size} is too small: while an episode of up to {longest} steps is written in each of "
+            f"{model.n_envs} environments, a complete one must remain to learn from. Set buffer_size={2 * needed} or more."
+        )
 
 
 def _max_episode_steps(env: VecEnv) -> int | None:
