@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from sb3_cpm.envs import observations as obs_tools
 from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, explained
 from sb3_cpm.envs.rendering import ensure_renderer
-from sb3_cpm.envs.visuals import VisualsContext, choose_visuals
+from sb3_cpm.envs.visuals import Visuals, choose_visuals
 
 OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
 """Our observation modes and ManiSkill's. "rgb+position+segmentation" costs the same one render as "rgb" alone."""
@@ -56,7 +56,7 @@ class ManiSkillEnv(gym.Wrapper[dict[str, np.ndarray], np.ndarray, Any, Any]):
         max_distance: float,
         max_episode_steps: int,
         ignore_terminations: bool,
-        visuals: VisualsContext,
+        visuals: Visuals,
     ):
         super().__init__(env)
         self.obs_mode = obs_mode

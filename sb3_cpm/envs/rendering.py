@@ -1,13 +1,293 @@
-"""stub"""
-from typing import NamedTuple
+"""
+A renderer on any machine: finding out whether SAPIEN can really render here, curing it if not, and choosing the renderer
+when an environment is made.
+
+SAPIEN draws with Vulkan. Whether that works cannot be asked politely: without a driver SAPIEN raises, with an odd driver the
+process dies. So :func:`probe_renderer` tries it in a child process, :func:`setup_rendering` installs software Vulkan where the
+probe fails (:mod:`sb3_cpm.envs.vulkan`), and :func:`ensure_renderer` is the fast part that every environment goes through.
+"""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_cpm.envs import vulkan
+
+CURE = "Run `python -m sb3_cpm setup-rendering` once: it installs software Vulkan, with or without root."
+SOFTWARE = ("llvmpipe", "swiftshader")
+"""Parts of the device names of renderers that run on the CPU."""
+
+BRDF_DECLARATION = re.compile(r"^.*uniform sampler2D samplerBRDFLUT;\s*$", re.MULTILINE)
+BRDF_LOOKUP = "texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy"
+
 
 class Renderer(NamedTuple):
+    """
+    A renderer that works.
+
+    :param backend: what ManiSkill calls it: ``"gpu"`` or ``"cpu"``
+    :param name: name of the Vulkan device
+    :param software: whether the CPU draws, which makes triangles dear
+    """
+
     backend: str
     name: str
     software: bool
 
+
+class Probe(NamedTuple):
+    """
+    What came of a trial in a child process.
+
+    :param renderer: None if it failed
+    :param problem: why it failed, in one paragraph; empty if it did not
+    :param seconds: how long it took
+    """
+
+    renderer: Renderer | None
+    problem: str
+    seconds: float
+
+
+_renderer: Renderer | None = None
+
+
 def ensure_renderer() -> Renderer:
+    """
+    Choose this process's renderer: a real GPU if it is usable, else the CPU's. Cheap after the first call, and the first
+    costs little more than the import of SAPIEN.
+
+    :raises ImportError: if ManiSkill is not installed
+    :raises RuntimeError: if this machine cannot render, with the cure
+    """
+    global _renderer
+    if _renderer is None:
+        for package in ("sapien", "mani_skill"):
+            if importlib.util.find_spec(package) is None:
+                raise ImportError(f"{package} is not installed: pip install 'sb3_cpm[maniskill]'")
+        vulkan.activate_private()
+        # A worker thread pool for pictures of 32x32 costs more than it brings, all the more with several environments.
+        os.environ.setdefault("LP_NUM_THREADS", "0")
+        _renderer, _ = _open_renderer()
+        if _renderer.software:
+            use_fast_shaders()
+    return _renderer
+
+
+def _open_renderer() -> tuple[Renderer, Any]:
+    """:return: the renderer and SAPIEN's render system, which fixes the process's Vulkan device"""
+    try:
+        import sapien
+    except ImportError as error:  # a shared library is missing
+        raise RuntimeError(f"SAPIEN cannot be imported: {error}. {CURE}") from error
+    try:
+        devices = device_names(sapien.render.get_device_summary())
+    except RuntimeError as error:
+        raise RuntimeError(f"No usable Vulkan driver on this machine (SAPIEN says: {error}). {CURE}") from error
+    problem: Exception | None = None
+    for backend, device in (("gpu", "cuda"), ("cpu", "cpu")):
+        names = [name for name, is_cuda in devices if is_cuda == (backend == "gpu")]
+        if not names:
+            continue
+        try:
+            system = sapien.render.RenderSystem(sapien.Device(device))
+        except RuntimeError as error:
+            problem = error
+            continue
+        software = backend == "cpu" and any(word in name.lower() for name in names for word in SOFTWARE)
+        return Renderer(backend, names[0], software), system
+    raise RuntimeError(f"SAPIEN can use none of {[name for name, _ in devices]} (it says: {problem}). {CURE}")
+
+
+def device_names(summary: str) -> list[tuple[str, bool]]:
+    """
+    :param summary: SAPIEN's list of Vulkan devices
+    :return: name and whether it is a CUDA device, of all devices that SAPIEN supports
+    """
+    devices = []
+    for block in re.split(r"^GPU: ", summary, flags=re.MULTILINE)[1:]:
+        if re.search(r"Supported:\s*1", block):
+            cuda = re.search(r"cudaId:\s*(-?\d+)", block)
+            devices.append((block.splitlines()[0].strip(), cuda is not None and int(cuda[1]) >= 0))
+    return devices
+
+
+# ---------------------------------------------------------------------- shaders
+def use_fast_shaders() -> bool:
+    """
+    Make SAPIEN use a copy of its shaders that never reads the lookup table for reflections of an environment map.
+
+    SAPIEN computes that table before the first picture in every process, which takes a software renderer 15 CPU seconds. With the
+    lookup replaced by zero the pictures are the same to the last bit, since no scene of ManiSkill's robot tasks has an environment
+    map (ReplicaCAD's rooms do). The function that sets the folder is private to SAPIEN: where anything is not as
+    expected, SAPIEN's own shaders stay, and the first picture takes its time.
+
+    :return: whether the copy is in use
+    """
+    try:
+        import sapien
+
+        folder = _shader_copy(Path(sapien.__file__).parent / "vulkan_shader", sapien.__version__)
+        if folder is not None:
+            sapien.pysapien.render._internal_set_shader_search_path(str(folder))
+        return folder is not None
+    except (AttributeError, OSError, TypeError):
+        return False
+
+
+def _shader_copy(original: Path, version: str) -> Path | None:
+    target = vulkan.cache_folder() / f"shaders-{version}"
+    if target.exists():
+        return target
+    with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
+        copy = Path(temporary, "shaders")
+        shutil.copytree(original, copy)
+        for path in [p for pack in ("minimal", "default") for p in (copy / pack).iterdir()]:
+            text = path.read_text()
+            text = BRDF_DECLARATION.sub("", text).replace(BRDF_LOOKUP, "vec2(0)")
+            if "samplerBRDFLUT" in text:
+                return None  # this version uses the table in a way that we do not know
+            path.write_text(text)
+        publish(copy, target)
+    return target
+
+
+def publish(folder: Path, target: Path) -> None:
+    """Move a finished folder to its place in one step; if another process was faster, its equal result stays."""
+    try:
+        os.rename(folder, target)
+    except OSError:
+        if not target.exists():
+            raise
+
+
+# ---------------------------------------------------------------------- trying it
+def probe_renderer(use_private: bool = True, timeout: float = 180.0) -> Probe:
+    """
+    Draw one picture in a child process and look at it.
+
+    :param use_private: whether a private software driver may be used
+    :param timeout: seconds until a hanging child is given up
+    """
+    start = time.perf_counter()
+    code = f"from sb3_cpm.envs.rendering import _probe; _probe({use_private!r})"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    if not use_private:
+        # an activated private driver is in our own environment, from where the child would inherit it
+        environment = {k: v for k, v in environment.items() if v != str(vulkan.private_folder() / "icd.json")}
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", code], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout
+        )
+    except subprocess.TimeoutExpired as error:
+        stage = _stage(error.stdout.decode(errors="replace") if isinstance(error.stdout, bytes) else error.stdout or "")
+        return Probe(None, f"The trial hung for {timeout:g} s while it tried to {stage}.", timeout)
+    seconds = time.perf_counter() - start
+    if child.returncode < 0:
+        name = signal.Signals(-child.returncode).name
+        return Probe(None, f"The trial process died of {name} while it tried to {_stage(child.stdout)}.", seconds)
+    result = [line for line in child.stdout.splitlines() if line.startswith("{")]
+    if child.returncode != 0 or not result:
+        last = (child.stderr.strip().splitlines() or ["no message"])[-1]
+        return Probe(None, f"{last} (while it tried to {_stage(child.stdout)})", seconds)
+    return Probe(Renderer(**json.loads(result[-1])), "", seconds)
+
+
+def _stage(output: str) -> str:
+    stages = [line[1:] for line in output.splitlines() if line.startswith(">")]
+    return stages[-1] if stages else "start"
+
+
+def _probe(use_private: bool) -> None:
+    """In the child: say what comes next before each step, since any of them may be the last."""
+
+    def stage(text: str) -> None:
+        print(f">{text}", flush=True)
+
+    if use_private:
+        stage("load the private Vulkan driver")
+        vulkan.activate_private()
+    os.environ.setdefault("LP_NUM_THREADS", "0")
+    stage("import SAPIEN and open a Vulkan device")
+    renderer, system = _open_renderer()
+    if renderer.software:
+        use_fast_shaders()
+    stage("draw a picture")
     import sapien
-    import mani_skill.envs
-    s = sapien.render.get_device_summary()
-    return Renderer("cpu", s.splitlines()[0], True)
+
+    sapien.render.set_camera_shader_dir("default")
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), system])
+    scene.set_ambient_light([1, 1, 1])
+    builder = scene.create_actor_builder()
+    builder.add_box_visual(half_size=[0.1, 0.1, 0.1], material=[1.0, 0.0, 0.0])
+    builder.initial_pose = sapien.Pose([1, 0, 0])
+    builder.build_static()
+    camera = scene.add_camera("probe", width=17, height=17, fovy=1.0, near=0.01, far=10)
+    scene.update_render()
+    camera.take_picture()
+    red, green, blue = (float(value) for value in camera.get_picture("Color")[8, 8, :3])
+    if not (red > 0.1 and green < red / 2 and blue < red / 2):
+        raise RuntimeError(f"The picture is wrong: a red box came out as RGB ({red:.2f}, {green:.2f}, {blue:.2f})")
+    print(json.dumps(renderer._asdict()), flush=True)
+
+
+# ---------------------------------------------------------------------- curing it
+def setup_rendering(private: bool = False) -> int:
+    """
+    Make this machine able to render and say what is being done. Does nothing if it is able already. Asks nothing.
+
+    :param private: install software Vulkan into the user's cache folder even as root
+    :return: exit status, 0 if SAPIEN renders in the end
+    """
+    print("Rendering: trying this machine's own Vulkan driver ...", flush=True)
+    probe = probe_renderer(use_private=False)
+    if probe.renderer is not None and not private:
+        return _report(probe)
+    print(f"  {probe.problem or 'it works, but a private one is wanted'}")
+    if vulkan.private_folder().exists():
+        print(f"Rendering: trying the software Vulkan in {vulkan.private_folder()} ...", flush=True)
+        probe = probe_renderer()
+        if probe.renderer is not None:
+            return _report(probe)
+        print(f"  {probe.problem}")
+    if importlib.util.find_spec("sapien") is None:
+        print("Rendering: FAILED. SAPIEN is not installed. Cure: pip install 'sb3_cpm[maniskill]'")
+        return 1
+    if named := vulkan.named_drivers():
+        print(f"Rendering: FAILED. The environment names a Vulkan driver that does not work: {named}. Cure: unset it, run this again.")
+        return 1
+    if not sys.platform.startswith("linux"):
+        print("Rendering: FAILED. Software Vulkan can be installed automatically on Linux only; install a graphics driver.")
+        return 1
+    try:
+        if os.geteuid() == 0 and not private:
+            print("Rendering: installing Mesa's software Vulkan (lavapipe) for the whole machine ...", flush=True)
+            vulkan.install_system()
+        else:
+            print(f"Rendering: installing Mesa's software Vulkan (lavapipe) into {vulkan.private_folder()} ...", flush=True)
+            vulkan.install_private()
+    except (RuntimeError, OSError) as error:
+        print(f"Rendering: FAILED. {error}")
+        print("Cure: see to the above (network? package sources? free space: 400 MB), then run this again.")
+        return 1
+    print("Rendering: trying again ...", flush=True)
+    return _report(probe_renderer())
+
+
+def _report(probe: Probe) -> int:
+    if probe.renderer is None:
+        print(f"Rendering: FAILED. {probe.problem}")
+        print("Cure: run `python -m sb3_cpm doctor` and send its output with your bug report.")
+        return 1
+    kind = "in software" if probe.renderer.software else "with the graphics card"
+    print(f"Rendering: SAPIEN renders {kind}: {probe.renderer.name} ({probe.seconds:.1f} s).")
+    return 0
