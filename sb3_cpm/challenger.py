@@ -7,10 +7,7 @@ come from torch's global generator, so that one seed rules the run.
 
 import math
 import os
-import pickle
-import zipfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,13 +20,11 @@ from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
-from sb3_cpm.world_model.observations import ObservationSpec
+from sb3_cpm.world_model.checkpoint import check_sizes, read_file, write_file
+from sb3_cpm.world_model.observations import ObservationSpec, check_action_space
 from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import Sequences, WorldModel, WorldModelOutput
-
-FILE_FORMAT = "sb3_cpm challenger"
-FILE_VERSION = 1
 
 Array = np.ndarray | torch.Tensor
 
@@ -63,7 +58,7 @@ class Challenger:
         self.preset = make_preset(preset, **overrides)
         self.device = choose_device(device)
         check_action_space(action_space)
-        self.action_space = action_space
+        self.observation_space, self.action_space = observation_space, action_space
         self.action_dim = int(np.prod(action_space.shape))
         self.spec = ObservationSpec(observation_space, keys, squash=self.preset["symlog_vectors"])
         self.keys: tuple[str, ...] = self.spec.keys
@@ -240,7 +235,9 @@ class Challenger:
         total = torch.stack(list(output.losses.values())).sum()
         if not torch.isfinite(total):
             broken = {name: value.item() for name, value in output.losses.items() if not math.isfinite(value.item())}
-            raise RuntimeError(f"The world model's loss became non-finite in the terms {broken or 'that are summed'}. {ADVICE}")
+            raise RuntimeError(
+                f"The world model's loss became non-finite in the terms {broken or 'that are summed'}. {ADVICE}"
+            )
         norm = self.optimizers["world_model"].step(total)
         losses = {f"{name}_loss": value for name, value in output.losses.items()}
         return {"world_model_loss": total, **losses, **output.metrics, "world_model_grad_norm": norm}
@@ -329,29 +326,25 @@ class Challenger:
         :param path: of the file
         :param include_rng: also torch's global random state
         """
-        content = {
-            "format": FILE_FORMAT,
-            "version": FILE_VERSION,
-            "config": self._config(),
-            "state": self.state_dict(include_rng),
-        }
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = target.with_name(f"{target.name}.{os.getpid()}.tmp")
-        try:
-            with open(unfinished, "wb") as file:
-                torch.save(content, file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(unfinished, target)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        write_file(path, {"config": self._config(), "state": self.state_dict(include_rng)})
+
+    def load_state(self, path: str | os.PathLike, restore_rng: bool = False) -> None:
+        """
+        Take over what :meth:`save` wrote, in a challenger that was built for the same spaces and preset.
+
+        :param path: of the file
+        :param restore_rng: also set torch's global random state
+        :raises ValueError: for damaged or foreign files, and for challengers of other keys or sizes; nothing is changed then
+        """
+        content = read_file(path, self.device)
+        theirs, ours = content["config"]["keys"], self._config()["keys"]
+        if list(theirs.items()) != list(ours.items()):
+            raise ValueError(f"{path} was saved for the observations {theirs}, this challenger reads {ours}.")
+        self.load_state_dict(content["state"], restore_rng)
 
     def _config(self) -> dict[str, Any]:
         """Plain data only: files are read without executing anything in them."""
-        keys = {
-            key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys
-        }
+        keys = {key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys}
         action = {"low": self.action_space.low.tolist(), "high": self.action_space.high.tolist()}
         return {
             "keys": keys,
@@ -408,54 +401,3 @@ def choose_device(device: torch.device | str) -> torch.device:
     if str(device).startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"Device {str(device)!r} was asked for, but torch sees no GPU. Use device='auto' or 'cpu'.")
     return get_device(device)
-
-
-def check_action_space(space: spaces.Space) -> None:
-    """
-    :raises ValueError: unless it is a bounded Box
-    """
-    if not isinstance(space, spaces.Box):
-        raise ValueError(f"The challenger needs a continuous action space (Box), got {space}.")
-    if not np.prod(space.shape):
-        raise ValueError(f"The action space {space} has no dimension to act in.")
-    if not space.is_bounded():
-        raise ValueError(
-            f"The action space must be bounded on both sides, got {space}. Rescale it, for example with "
-            "gymnasium.wrappers.RescaleAction, or state the bounds that the environment clips to."
-        )
-
-
-def check_sizes(name: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """
-    :raises ValueError: naming the first weight that is missing, unknown or of another shape
-    """
-    for key, value in own.items():
-        if key not in other:
-            raise ValueError(f"The saved challenger has no weight {name}.{key}: it was built with another preset or space.")
-        if tuple(other[key].shape) != tuple(value.shape):
-            raise ValueError(
-                f"The saved challenger has other sizes: {name}.{key} is {tuple(other[key].shape)} there and "
-                f"{tuple(value.shape)} here. Build it with the preset and spaces it was saved with, or use Challenger.load."
-            )
-    for key in other:
-        if key not in own:
-            raise ValueError(f"The saved challenger has an additional weight {name}.{key}: it was built with another preset.")
-
-
-def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
-    """
-    Content of a saved challenger, checked.
-
-    :raises ValueError: for files that are missing, damaged or something else
-    """
-    if not Path(path).is_file():
-        raise ValueError(f"There is no file {path}.")
-    try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-        raise ValueError(f"{path} is damaged or no saved challenger ({type(error).__name__}: {error}).") from error
-    if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
-        raise ValueError(f"{path} is no saved challenger.")
-    if content.get("version") != FILE_VERSION:
-        raise ValueError(f"{path} has file version {content.get('version')}, this package reads {FILE_VERSION}.")
-    return content

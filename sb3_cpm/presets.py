@@ -88,10 +88,9 @@ DEFAULT: dict[str, Any] = {
 
 PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}
 
-_POSITIVE_INTEGERS = (
-    "batch_size sequence_length cnn_depth cnn_layers vector_units stoch_size stoch_classes deter_size hidden_size head_units "
-    "horizon actor_units critic_units slow_target_every"
-).split()
+_POSITIVE_INTEGERS = [
+    key for key in REPORT if key.endswith(("_size", "_length", "_units", "_classes", "_every")) or key.startswith("cnn_")
+] + ["horizon"]
 
 
 def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -> dict[str, Any]:

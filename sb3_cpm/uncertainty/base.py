@@ -22,7 +22,7 @@ class Transitions(NamedTuple):
     :param action: the action taken *in state t*, shape ``(*batch, action_dim)``. In a
         :class:`~sb3_cpm.type_aliases.SequenceBatch` that is the action stored in row t+1; the one in row t led to state t
         and says nothing about state t+1
-    :param next_stoch: expectation of the stochastic part of state t+1 (a sample in imagination), shape ``(*batch, stoch_size)``
+    :param next_stoch: stochastic part of state t+1, its expectation (a sample in imagination), ``(*batch, stoch_size)``
     :param next_deter: deterministic part of state t+1, shape ``(*batch, deter_size)``
     :param next_embed: encoder output of state t+1, shape ``(*batch, embed_dim)``; None in imagination
     """

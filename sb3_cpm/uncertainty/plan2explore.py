@@ -6,6 +6,7 @@ are; where data are scarce they still say what their different initial weights s
 """
 
 import math
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -32,7 +33,7 @@ class Ensemble(nn.Module):
         super().__init__()
         sizes = [input_dim, *[units] * layers, output_dim]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for size_in, size_out in zip(sizes, sizes[1:], strict=False):
+        for size_in, size_out in pairwise(sizes):
             bound = math.sqrt(6.0 / (size_in + size_out))  # Glorot, for each head on its own
             self.weights.append(nn.Parameter(torch.empty(heads, size_in, size_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.zeros(heads, 1, size_out)))
@@ -73,7 +74,7 @@ class ExpScale:
         for name, (low, high) in (("mean_range", mean_range), ("max_range", max_range)):
             if not (factor > 1.0 and 0.0 < low * factor < high / factor):
                 raise ValueError(
-                    f"{name}={(low, high)} is too narrow for factor={factor}: one step has to end inside, so low * factor must "
+                    f"{name}={(low, high)} is too narrow for factor={factor}: a step has to end inside, so low * factor must "
                     "be smaller than high / factor. Widen the interval or lower the factor."
                 )
         self.mean_range, self.max_range, self.factor = tuple(mean_range), tuple(max_range), factor
@@ -148,7 +149,7 @@ class Plan2Explore(Uncertainty):
         output_dim = {"feat": sizes.feat, "stoch": sizes.stoch, "deter": sizes.deter, "embed": sizes.embed}[target]
         self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units)
         self.rule = ExpScale(mean_range, max_range, scale_factor)
-        self.register_buffer("k", torch.ones((), dtype=torch.float64))
+        self.register_buffer("k", torch.ones(()))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
 
     def predict(self, transitions: Transitions) -> torch.Tensor:
@@ -170,7 +171,7 @@ class Plan2Explore(Uncertainty):
         """The metric: raw disagreement d to novelty, shape as given."""
         if self.metric == "log":
             return (disagreement + self.epsilon).log()
-        exponent = self.k.to(disagreement.dtype) * disagreement
+        exponent = self.k * disagreement
         beyond = (exponent - self.exponent_limit).clamp(min=0.0)
         bounded = exponent.clamp(max=self.exponent_limit)
         return torch.expm1(bounded) + math.exp(self.exponent_limit) * beyond

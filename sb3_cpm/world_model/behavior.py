@@ -83,7 +83,7 @@ class ActorCritic(nn.Module):
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
 
     def _make_critic(self, feat_dim: int) -> MLP:
-        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1).apply(initialize)  # type: ignore
+        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1).apply(initialize)
 
     def make_optimizers(self) -> dict[str, Optimizer]:
         """Optimizers of actor and critic, by name."""

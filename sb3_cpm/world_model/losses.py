@@ -43,9 +43,7 @@ def balanced_kl(
     return balance * prior_side + (1.0 - balance) * posterior_side
 
 
-def lambda_returns(
-    rewards: torch.Tensor, values: torch.Tensor, discounts: torch.Tensor, lambda_: float
-) -> torch.Tensor:
+def lambda_returns(rewards: torch.Tensor, values: torch.Tensor, discounts: torch.Tensor, lambda_: float) -> torch.Tensor:
     """
     TD(lambda) targets: G_i = r_i + d_i * ((1 - lambda) * v_i + lambda * G_{i+1}), with the last v instead of G behind the end.
 

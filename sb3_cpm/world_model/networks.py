@@ -16,6 +16,11 @@ def initialize(module: nn.Module) -> None:
             nn.init.zeros_(module.bias)
 
 
+def channels_last(module: nn.Sequential) -> nn.Sequential:
+    """Store the weights of convolutions as the images come, channels last."""
+    return module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
+
+
 class MLP(nn.Sequential):
     """
     Dense layers with ELU, and a linear output layer where ``output_dim`` is given.
@@ -99,7 +104,7 @@ class ConvEncoder(nn.Module):
             out = depth * min(2**layer, 8)
             modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), nn.ELU()]
             channels = out
-        self.convolutions = nn.Sequential(*modules).to(memory_format=torch.channels_last)
+        self.convolutions = channels_last(nn.Sequential(*modules))
         self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -126,7 +131,7 @@ class ConvDecoder(nn.Module):
         modules: list[nn.Module] = []
         for narrow, wide in zip([*widths[1:], channels], widths, strict=True):
             modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU()]
-        self.convolutions = nn.Sequential(*modules[:-1]).to(memory_format=torch.channels_last)
+        self.convolutions = channels_last(nn.Sequential(*modules[:-1]))
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:
         features = self.linear(feat).unflatten(1, self.feature_map)

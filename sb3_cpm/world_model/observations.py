@@ -183,3 +183,18 @@ def is_vector(space: spaces.Space) -> bool:
 def is_cloud(space: spaces.Space) -> bool:
     """2-D float Box, (points, features)."""
     return isinstance(space, spaces.Box) and len(space.shape) == 2 and np.issubdtype(space.dtype, np.floating)
+
+
+def check_action_space(space: spaces.Space) -> None:
+    """
+    :raises ValueError: unless it is a bounded Box
+    """
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"The challenger needs a continuous action space (Box), got {space}.")
+    if not np.prod(space.shape):
+        raise ValueError(f"The action space {space} has no dimension to act in.")
+    if not space.is_bounded():
+        raise ValueError(
+            f"The action space must be bounded on both sides, got {space}. Rescale it, for example with "
+            "gymnasium.wrappers.RescaleAction, or state the bounds that the environment clips to."
+        )

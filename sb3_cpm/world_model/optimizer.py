@@ -30,7 +30,7 @@ class Optimizer:
         named = [item for module in modules for item in module.named_parameters() if item[1].requires_grad]
         self.name, self.clip, self.weight_decay = name, clip, weight_decay
         self.parameters = [parameter for _, parameter in named]
-        self.decayed = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
+        self.decayed: list[torch.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
         self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
 
     def step(self, loss: torch.Tensor) -> torch.Tensor:

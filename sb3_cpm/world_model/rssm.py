@@ -68,9 +68,7 @@ class RSSM(nn.Module):
         self.input_stoch = nn.Linear(latent.size, hidden_size)
         self.input_action = nn.Linear(action_dim, hidden_size, bias=False)
         self.gru = GRUCell(hidden_size, deter_size)
-        self.prior_net = nn.Sequential(
-            nn.Linear(deter_size, hidden_size), nn.ELU(), nn.Linear(hidden_size, latent.stats_size)
-        )
+        self.prior_net = nn.Sequential(nn.Linear(deter_size, hidden_size), nn.ELU(), nn.Linear(hidden_size, latent.stats_size))
         self.posterior_deter = nn.Linear(deter_size, hidden_size)
         self.posterior_embed = nn.Linear(embed_dim, hidden_size, bias=False)
         self.posterior_out = nn.Linear(hidden_size, latent.stats_size)

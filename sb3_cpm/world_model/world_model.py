@@ -90,9 +90,7 @@ class WorldModel(nn.Module):
         posterior = self.rssm.observe(embed, batch.actions, batch.is_first)
         prior = self.rssm.prior(posterior.deter)
         feat = posterior.feat
-        kl = balanced_kl(
-            self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"]
-        )
+        kl = balanced_kl(self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"])
         losses = {"kl": self.preset["kl_scale"] * kl}
         metrics = {}
         reconstructions, errors = self._reconstruction_losses(feat, batch)
