@@ -35,6 +35,9 @@ SHARE = 0.05
 FEWEST, MOST = 64, 1500
 """Triangles of one colour of one link."""
 
+SMALL = 0.15
+"""Metres; a part of at most this size may be drawn as its convex hull."""
+
 FORMATS = (".glb", ".gltf", ".stl", ".obj", ".ply")
 """Mesh files that are decimated; others (Collada) stay as they are."""
 
@@ -106,8 +109,7 @@ def light_robot(urdf: Path) -> Path:
     :return: the light one, in the cache folder; made if it is not there yet
     """
     tree = ElementTree.parse(urdf)
-    meshes = {mesh for mesh in tree.iter("mesh")}
-    key = hashlib.sha256(f"{FORMAT} {SHARE} {FEWEST} {MOST} {urdf.resolve()}".encode() + urdf.read_bytes())
+    key = hashlib.sha256(f"{FORMAT} {SHARE} {FEWEST} {MOST} {SMALL} {urdf.resolve()}".encode() + urdf.read_bytes())
     for mesh in tree.iter("mesh"):
         path = urdf.parent / mesh.attrib["filename"]
         key.update(f"{path} {path.stat().st_size if path.exists() else None}".encode())
@@ -117,7 +119,7 @@ def light_robot(urdf: Path) -> Path:
             folder = Path(temporary, "robot")
             folder.mkdir()
             visual = {mesh for element in tree.iter("visual") for mesh in element.iter("mesh")}
-            for mesh in meshes:
+            for mesh in list(tree.iter("mesh")):
                 original = urdf.parent / mesh.attrib["filename"]
                 # the folder moves to `target` when it is complete
                 light = _light_mesh(original, folder) if mesh in visual else None
@@ -164,6 +166,8 @@ def _decimate(mesh: Any) -> Any:
     welded = mesh.copy()
     welded.merge_vertices(merge_tex=True, merge_norm=True)  # a vertex per face corner cannot be decimated
     light = welded.simplify_quadric_decimation(face_count=wanted)
+    if len(light.faces) > 2 * wanted and max(mesh.extents) < SMALL:
+        light = welded.convex_hull  # a hand camera's screws and lenses: a thousand separate parts resist decimation
     if material is not None:
         light.visual = trimesh.visual.TextureVisuals(material=material)
     return light
