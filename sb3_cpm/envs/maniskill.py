@@ -24,7 +24,7 @@ OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
 """Our observation modes and ManiSkill's. "rgb+position+segmentation" costs the same one render as "rgb" alone."""
 
 
-class ManiSkillEnv(gym.Wrapper[dict[str, np.ndarray], np.ndarray, Any, Any]):
+class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
     """
     One ManiSkill environment on the CPU simulator, as gymnasium means it. Use :func:`make_maniskill_env` to get one.
 
@@ -98,18 +98,18 @@ class ManiSkillEnv(gym.Wrapper[dict[str, np.ndarray], np.ndarray, Any, Any]):
         truncated = info["elapsed_steps"] >= self.max_episode_steps
         return self._observe(raw), float(reward), over, bool(truncated), info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """
         :return: the scene from the task's camera for people, goal marker included, shape ``(height, width, 3)``, uint8; a
             render of its own, so call it for videos only. None if made with ``render_mode=None``.
         """
         if self.render_mode is None:
             return None
-        frame = self.unwrapped.render()
+        frame: Any = self.unwrapped.render()
         return np.array(frame[0].cpu().numpy(), dtype=np.uint8)
 
     @property
-    def spec(self) -> gym.envs.registration.EnvSpec | None:
+    def spec(self) -> gym.envs.registration.EnvSpec | None:  # type: ignore[override]
         """ManiSkill's spec with the number of steps that really ends an episode."""
         spec = copy.copy(self.unwrapped.spec)
         if spec is not None:

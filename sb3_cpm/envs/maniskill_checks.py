@@ -124,9 +124,8 @@ def _check_assets(env_id: str, asset_ids: Any) -> None:
         for source_id in assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else (asset_id,):
             source = assets.DATA_SOURCES[source_id]
             folder = Path(source.output_dir) / source.target_path
-            if not folder.exists() or not (folder / ASSET_FILES.get(source_id, "")).exists():
-                missing.append(source_id)
-            elif folder.is_dir() and not any(folder.iterdir()):
+            empty = folder.is_dir() and not any(folder.iterdir())
+            if empty or not (folder / ASSET_FILES.get(source_id, "")).exists():
                 missing.append(source_id)
     if missing:
         names = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
@@ -137,8 +136,8 @@ def _missing_assets(env_id: str, what: str) -> RuntimeError:
     from mani_skill import ASSET_DIR
 
     return RuntimeError(
-        f"{env_id} needs files that are not here or not complete: {what}. They belong into {ASSET_DIR} (the environment variable "
-        f"MS_ASSET_DIR moves that). Download them, after removing incomplete folders, with:\n"
+        f"{env_id} needs files that are not here or not complete: {what}. They belong into {ASSET_DIR} (the environment "
+        f"variable MS_ASSET_DIR moves that). Download them, after removing incomplete folders, with:\n"
         f"    python -m mani_skill.utils.download_asset {env_id}"
     )
 

@@ -126,10 +126,10 @@ def use_fast_shaders() -> bool:
     """
     Make SAPIEN use a copy of its shaders that never reads the lookup table for reflections of an environment map.
 
-    SAPIEN computes that table before the first picture in every process, which takes a software renderer 15 CPU seconds. With the
-    lookup replaced by zero the pictures are the same to the last bit, since no scene of ManiSkill's robot tasks has an environment
-    map (ReplicaCAD's rooms do). The function that sets the folder is private to SAPIEN: where anything is not as
-    expected, SAPIEN's own shaders stay, and the first picture takes its time.
+    SAPIEN computes that table before the first picture in every process, which takes a software renderer 15 CPU seconds.
+    With the lookup replaced by zero the pictures are the same to the last bit, since no scene of ManiSkill's robot tasks has
+    an environment map (ReplicaCAD's rooms do). The function that sets the folder is private to SAPIEN: where anything is
+    not as expected, SAPIEN's own shaders stay, and the first picture takes its time.
 
     :return: whether the copy is in use
     """
@@ -186,7 +186,12 @@ def probe_renderer(use_private: bool = True, timeout: float = 180.0) -> Probe:
         environment = {k: v for k, v in environment.items() if v != str(vulkan.private_folder() / "icd.json")}
     try:
         child = subprocess.run(
-            [sys.executable, "-c", code], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout
+            [sys.executable, "-c", code],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
         )
     except subprocess.TimeoutExpired as error:
         stage = _stage(error.stdout.decode(errors="replace") if isinstance(error.stdout, bytes) else error.stdout or "")
@@ -263,7 +268,7 @@ def setup_rendering(private: bool = False) -> int:
         print("Rendering: FAILED. SAPIEN is not installed. Cure: pip install 'sb3_cpm[maniskill]'")
         return 1
     if named := vulkan.named_drivers():
-        print(f"Rendering: FAILED. The environment names a Vulkan driver that does not work: {named}. Cure: unset it, run this again.")
+        print(f"Rendering: FAILED. The environment names a Vulkan driver that does not work: {named}. Cure: unset it.")
         return 1
     if not sys.platform.startswith("linux"):
         print("Rendering: FAILED. Software Vulkan can be installed automatically on Linux only; install a graphics driver.")
@@ -271,10 +276,10 @@ def setup_rendering(private: bool = False) -> int:
     try:
         if os.geteuid() == 0 and not private:
             print("Rendering: installing Mesa's software Vulkan (lavapipe) for the whole machine ...", flush=True)
-            vulkan.install_system()
+            vulkan.install_system(print)
         else:
             print(f"Rendering: installing Mesa's software Vulkan (lavapipe) into {vulkan.private_folder()} ...", flush=True)
-            vulkan.install_private()
+            vulkan.install_private(print)
     except (RuntimeError, OSError) as error:
         print(f"Rendering: FAILED. {error}")
         print("Cure: see to the above (network? package sources? free space: 400 MB), then run this again.")

@@ -1,16 +1,17 @@
 """
 Light visuals: what a software renderer can draw fast.
 
-On a CPU, ManiSkill's pictures are slow because of triangles, not pixels: the Panda's hand camera alone has 425,160 of them, its
-links 135,000, the floor 20,000. Light visuals replace the robot's *visual* meshes by decimated ones with the same colours and
-the floor by two triangles. Collision shapes, masses, joints and the floor's collision plane stay, so the physics stay the
-same to the last bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
+On a CPU, ManiSkill's pictures are slow because of triangles, not pixels: the Panda's hand camera alone has 425,160 of
+them, its links 135,000, the floor 20,000. Light visuals replace the robot's *visual* meshes by decimated ones with the same
+colours and the floor by two triangles. Collision shapes, masses, joints and the floor's collision plane stay, so the
+physics stay the same to the last bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
 
 Decimated robots are kept in the cache folder (:func:`sb3_cpm.envs.vulkan.cache_folder`); making one takes about two seconds.
 """
 
 import contextlib
 import hashlib
+import importlib
 import inspect
 import shutil
 import sys
@@ -63,12 +64,12 @@ class Visuals(contextlib.AbstractContextManager[None]):
             # the class attribute, not a robot of our own: tasks place a robot by its name
             _swap(self._undo, self.agent_class, "urdf_path", str(self.urdf))
         if self.light_ground:
-            from mani_skill.utils.building.ground import build_ground as original
-
+            original: Any = importlib.import_module("mani_skill.utils.building.ground").build_ground
+            light = _light_ground(original)
             # modules hold the function under its name; a task of the user's own may do the same
             for module in list(sys.modules.values()):
                 if getattr(module, "__dict__", {}).get("build_ground") is original:
-                    _swap(self._undo, module, "build_ground", _light_ground(original))
+                    _swap(self._undo, module, "build_ground", light)
 
     def __exit__(self, *exception: object) -> None:
         self._undo.close()
@@ -96,7 +97,7 @@ def choose_visuals(visuals: str, software: bool, robot: str | None) -> Visuals:
     except ImportError as error:
         if visuals == "light":
             raise RuntimeError(f"visuals='light' needs {error.name}: pip install trimesh fast-simplification") from error
-        warnings.warn(f"Rendering will be slow: {error.name} is missing, pip install trimesh fast-simplification", stacklevel=2)
+        warnings.warn(f"Slow rendering, {error.name} is missing: pip install trimesh fast-simplification", stacklevel=2)
         return Visuals(light_ground=True)
 
 
@@ -213,9 +214,7 @@ def _plane(scene: Any, name: str, altitude: float, add_collision: bool) -> Any:
     return builder.build_static(name=name)
 
 
-def _quad(
-    corners: np.ndarray, origin: tuple[float, float], altitude: float, texture: tuple[str, int], square: float
-) -> Any:
+def _quad(corners: np.ndarray, origin: tuple[float, float], altitude: float, texture: tuple[str, int], square: float) -> Any:
     """
     :param corners: metres around the origin, shape ``(4, 2)``
     :param texture: file name and number of mipmap levels

@@ -14,7 +14,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 MINIMUM_MESA = (24, 3)
@@ -103,49 +103,51 @@ def _loads(path: Path) -> bool:
 
 
 # ---------------------------------------------------------------------- installing
-def install_system() -> None:
+def install_system(say: Callable[[str], None]) -> None:
     """
-    Install software Vulkan for the whole machine, as root. Adds Debian's backports suite if that is where a new enough Mesa is.
+    Install software Vulkan for the whole machine, as root; adds Debian's backports suite if only that has a new enough Mesa.
 
+    :param say: told what is being done
     :raises RuntimeError: if this machine's package sources have none
     """
-    _run(["apt-get", "update"])
+    _run(["apt-get", "update"], say)
     suite = _suite_with_driver([])
     if suite is None:
         backports = backports_source(_apt_sources(), _codename())
         if backports is not None:
             name, text = backports
-            print(f"  adding Debian's backports suite: /etc/apt/sources.list.d/{name}")
+            say(f"  adding Debian's backports suite: /etc/apt/sources.list.d/{name}")
             Path("/etc/apt/sources.list.d", name).write_text(text)
-            _run(["apt-get", "update"])
+            _run(["apt-get", "update"], say)
             suite = _suite_with_driver([])
     if suite is None:
         raise RuntimeError(_too_old())
     install = ["apt-get", "install", "-y", "--no-install-recommends"]
-    _run([*install, *LIBRARIES])
-    _run([*install, "-t", suite, DRIVER])
+    _run([*install, *LIBRARIES], say)
+    _run([*install, "-t", suite, DRIVER], say)
 
 
-def install_private() -> None:
+def install_private(say: Callable[[str], None]) -> None:
     """
     Install software Vulkan into :func:`private_folder`, as anybody: apt computes and downloads what this machine lacks,
     with all its own state in a private folder, and the packages are unpacked instead of installed.
 
+    :param say: told what is being done
     :raises RuntimeError: if there is no apt, or this machine's package sources have no new enough Mesa
     """
     with tempfile.TemporaryDirectory(dir=cache_folder()) as temporary:
         work = Path(temporary)
         apt = _private_apt(work)
-        _run(["apt-get", *apt, "update"])
+        _run(["apt-get", *apt, "update"], say)
         suite = _suite_with_driver(apt)
         if suite is None:
             raise RuntimeError(_too_old())
         download = ["apt-get", *apt, "install", "-y", "--no-install-recommends", "--download-only"]
         # two sets, unpacked in this order: where both hold a library, the one made for the newer driver stays
         for number, options in enumerate(([*LIBRARIES], ["-t", suite, DRIVER])):
-            _run([*download, "-o", f"Dir::Cache::archives={_folder(work / f'debs{number}/partial').parent}", *options])
+            _run([*download, "-o", f"Dir::Cache::archives={_folder(work / f'debs{number}/partial').parent}", *options], say)
             for package in sorted((work / f"debs{number}").glob("*.deb")):
-                _run(["dpkg-deb", "-x", str(package), str(_folder(work / "result/root"))], show=False)
+                _run(["dpkg-deb", "-x", str(package), str(_folder(work / "result/root"))])
         _write_icd(work / "result")
         shutil.rmtree(private_folder(), ignore_errors=True)
         os.rename(work / "result", private_folder())
@@ -183,7 +185,9 @@ def _write_icd(folder: Path) -> None:
     found = sorted((folder / "root/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
     libraries = sorted(folder.glob("root/usr/lib/*/libvulkan_lvp.so"))
     if not found or not libraries:
-        raise RuntimeError("The downloaded packages hold no lavapipe driver: this machine's packages have changed, please report.")
+        raise RuntimeError(
+            "The downloaded packages hold no lavapipe driver: the distribution has changed them, please report."
+        )
     description = json.loads(found[0].read_text())
     description["ICD"]["library_path"] = str(libraries[0])
     (folder / "icd.json").write_text(json.dumps(description, indent=2))
@@ -214,7 +218,7 @@ def backports_source(sources: dict[str, str], codename: str | None) -> tuple[str
     if codename is None:
         return None
     backports = f"{codename}-backports"
-    for name, text in sources.items():
+    for text in sources.values():
         active = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
         if backports in active:
             return None
@@ -240,7 +244,7 @@ def _with_suite(entry: str, codename: str, suite: str) -> str | None:
 
 def _suite_with_driver(apt_options: Sequence[str]) -> str | None:
     """:return: the suite with the newest driver that is new enough, None if none is"""
-    listing = _run(["apt-cache", *apt_options, "madison", DRIVER], show=False)
+    listing = _run(["apt-cache", *apt_options, "madison", DRIVER])
     return newest_suite(listing)
 
 
@@ -267,19 +271,19 @@ def _too_old() -> str:
     )
 
 
-def _run(command: list[str], show: bool = True) -> str:
+def _run(command: list[str], say: Callable[[str], None] | None = None) -> str:
     """Run a command that asks nothing; its output goes nowhere unless it fails."""
-    if show:
+    if say is not None:
         # the options that make apt private would only bury what is being done
         words = [w for i, w in enumerate(command) if w != "-o" and (i == 0 or command[i - 1] != "-o")]
-        print(f"  $ {' '.join(words)}", flush=True)
+        say(f"  $ {' '.join(words)}")
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C"}
     try:
         done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=900)
     except FileNotFoundError:
         raise RuntimeError(
-            f"{command[0]} is not on this machine, so software Vulkan cannot be installed automatically. Install Mesa's lavapipe "
-            f"driver, {MINIMUM_MESA[0]}.{MINIMUM_MESA[1]} or newer, with the system's package manager (Fedora: "
+            f"{command[0]} is not on this machine, so software Vulkan cannot be installed automatically. Install Mesa's "
+            f"lavapipe driver, {MINIMUM_MESA[0]}.{MINIMUM_MESA[1]} or newer, with the system's package manager (Fedora: "
             "mesa-vulkan-drivers, Arch: vulkan-swrast)."
         ) from None
     except subprocess.TimeoutExpired:
