@@ -55,7 +55,8 @@ class GRUCell(nn.Module):
     def __init__(self, input_dim: int, size: int) -> None:
         super().__init__()
         self.gates = nn.Linear(input_dim + size, 3 * size, bias=False)
-        self.norm = nn.LayerNorm(3 * size)
+        # after a reset memory, state and action are all zero: a smaller eps would blow up the gradient there
+        self.norm = nn.LayerNorm(3 * size, eps=1e-3)
 
     def forward(self, inputs: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
         gates = self.norm(self.gates(torch.cat((inputs, hidden), dim=-1)))
