@@ -4,5 +4,8 @@ Environments. The only place that imports ManiSkill or SAPIEN, and only when an 
 """
 
 from sb3_cpm.envs.maniskill import ManiSkillEnv, make_maniskill_env
+from sb3_cpm.envs.vulkan import forget_failed_opencv
+
+forget_failed_opencv()
 
 __all__ = ["ManiSkillEnv", "make_maniskill_env"]

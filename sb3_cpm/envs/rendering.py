@@ -180,7 +180,9 @@ def probe_renderer(use_private: bool = True, timeout: float = 180.0) -> Probe:
     """
     start = time.perf_counter()
     code = f"from sb3_cpm.envs.rendering import _probe; _probe({use_private!r})"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    # not the whole sys.path: a library that failed to import may have left its own folder there
+    package = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))}
     if not use_private:
         # an activated private driver is in our own environment, from where the child would inherit it
         environment = {k: v for k, v in environment.items() if v != str(vulkan.private_folder() / "icd.json")}

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -84,6 +85,15 @@ def activate_private() -> bool:
     for name in DRIVER_VARIABLES:
         os.environ[name] = str(icd)  # inherited by worker processes, which come through here again
     return True
+
+
+def forget_failed_opencv() -> None:
+    """
+    Stable-Baselines3 tries to import OpenCV and lives without it. Where OpenCV's system libraries are missing, the attempt
+    leaves OpenCV's own folder on ``sys.path``, whose ``typing`` hides Python's: from then on no worker process starts.
+    """
+    if "cv2" not in sys.modules:
+        sys.path[:] = [folder for folder in sys.path if os.path.basename(folder) != "cv2"]
 
 
 def _libraries(root: Path) -> Iterator[Path]:
