@@ -77,7 +77,9 @@ class ChallengerCallback(BaseCallback):
     ):
         super().__init__(verbose)
         if train_freq < 1 or gradient_steps < 0:
-            raise ValueError(f"train_freq must be at least 1 and gradient_steps at least 0, got {train_freq} and {gradient_steps}")
+            raise ValueError(
+                f"train_freq must be at least 1 and gradient_steps at least 0, got {train_freq} and {gradient_steps}"
+            )
         if unit not in ("step", "segment", "episode"):
             raise ValueError(f'unit must be "step", "segment" or "episode", got {unit!r}')
         if segment_length < 1:
@@ -143,11 +145,14 @@ class ChallengerCallback(BaseCallback):
         _check_learning_starts(model)  # type: ignore[arg-type]
         if self.challenger is None:
             self.challenger = self._make_challenger()
-        elif (self.challenger.observation_space, self.challenger.action_space) != (model.observation_space, model.action_space):
+        elif (self.challenger.observation_space, self.challenger.action_space) != (
+            model.observation_space,
+            model.action_space,
+        ):
             raise ValueError(
-                "This callback's challenger belongs to other spaces than the model's: observations "
-                f"{self.challenger.observation_space} against {model.observation_space}, actions {self.challenger.action_space} "
-                f"against {model.action_space}. Make a new ChallengerCallback."
+                "This callback's challenger belongs to other spaces than the model's: it has "
+                f"{self.challenger.observation_space} and {self.challenger.action_space}, the model "
+                f"{model.observation_space} and {model.action_space}. Make a new ChallengerCallback."
             )
 
     def _make_challenger(self) -> Challenger:
@@ -327,8 +332,8 @@ def _player_keys(model: OffPolicyAlgorithm) -> tuple[str, ...] | None:
     """Keys that P's features extractors read, where they tell; images that only C looks at need not be moved for P."""
     extractors = [
         module.features_extractor
-        for module in (model.policy, getattr(model, "actor", None), getattr(model, "critic", None))
-        if getattr(module, "features_extractor", None) is not None
+        for module in (getattr(model, name, None) for name in ("policy", "actor", "critic"))
+        if module is not None and getattr(module, "features_extractor", None) is not None
     ]
     keys = [getattr(extractor, "player_keys", None) for extractor in extractors]
     if not keys or any(read is None for read in keys):
@@ -341,12 +346,14 @@ def _check_model(model: Any) -> None:
     """Everything that must hold before the first step is taken."""
     name = type(model).__name__
     if not isinstance(model, OffPolicyAlgorithm):
-        raise ValueError(f"ChallengerCallback needs an off-policy algorithm with a CPMBuffer (SAC, TD3, DDPG, TQC), got {name}")
+        raise ValueError(
+            f"ChallengerCallback needs an off-policy algorithm with a CPMBuffer (SAC, TD3, DDPG, TQC), got {name}"
+        )
     if not isinstance(model.observation_space, spaces.Dict):
         raise ValueError(
             f"ChallengerCallback needs a Dict observation space, got {model.observation_space}. Wrap the environment in "
-            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...); CrossQ has no such policy, SAC, TD3, DDPG '
-            "and TQC do."
+            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...); CrossQ has no such policy, SAC, TD3, '
+            "DDPG and TQC do."
         )
     if not isinstance(model.action_space, spaces.Box):
         raise ValueError(f"ChallengerCallback needs continuous actions (a Box action space), got {model.action_space}")
@@ -366,8 +373,8 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
     needed = longest * model.n_envs
     if model.learning_starts < needed:
         raise ValueError(
-            f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps in "
-            f"each of {model.n_envs} environments. Set learning_starts={needed} or more."
+            f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps "
+            f"in each of {model.n_envs} environments. Set learning_starts={needed} or more."
         )
     if model.buffer_size < 2 * needed:
         raise ValueError(

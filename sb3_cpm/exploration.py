@@ -7,7 +7,7 @@ schedule convention: a function of the remaining progress, which falls from 1 to
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
@@ -48,7 +48,9 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
     if callable(decay):
         return decay
     if decay not in _DECAYS:
-        raise ValueError(f"Unknown decay {decay!r}, choose one of {sorted(_DECAYS)} or pass a function of the remaining progress")
+        raise ValueError(
+            f"Unknown decay {decay!r}, choose one of {sorted(_DECAYS)} or pass a function of the remaining progress"
+        )
     if not (0 <= floor <= start <= 1):
         raise ValueError(f"A decay needs 0 <= floor <= start <= 1, got start={start}, floor={floor}")
     if not rate > 0:
@@ -59,6 +61,14 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
         return floor + (start - floor) * shape(1.0 - progress_remaining, rate)
 
     return epsilon
+
+
+class _Row(NamedTuple):
+    """A state that C's latent state has yet to follow, with the action that led to it."""
+
+    observation: dict[str, np.ndarray]
+    action: np.ndarray
+    is_first: bool
 
 
 class ExplorationVecEnv(VecEnvWrapper):
@@ -94,6 +104,7 @@ class ExplorationVecEnv(VecEnvWrapper):
     ):
         super().__init__(venv)
         assert isinstance(self.action_space, spaces.Box)
+        self._low, self._high = self.action_space.low, self.action_space.high
         self.challenger = challenger
         self.epsilon = epsilon
         self.unit = unit
@@ -111,7 +122,7 @@ class ExplorationVecEnv(VecEnvWrapper):
         self._explores = np.zeros(self.num_envs, dtype=bool)
         self._unit_steps = np.zeros(self.num_envs, dtype=np.int64)  # since who acts was last drawn
         self._n_steps = 0
-        self._executed = np.zeros((self.num_envs, *self.action_space.shape), dtype=np.float32)
+        self._executed = np.zeros((self.num_envs, *self._low.shape), dtype=np.float32)
         for env_idx in range(self.num_envs):
             self._start_episode(env_idx, last_obs)
 
@@ -145,8 +156,8 @@ class ExplorationVecEnv(VecEnvWrapper):
         except (EOFError, ConnectionError) as error:
             self.on_failure()
             raise RuntimeError(
-                f"An environment process died at step {self._n_steps + 1} of this learn() ({type(error).__name__}). Everything up "
-                "to then is still there: model.save() and model.save_replay_buffer() work, and learn() with "
+                f"An environment process died at step {self._n_steps + 1} of this learn() ({type(error).__name__}). "
+                "Everything up to then is still there: model.save() and model.save_replay_buffer() work, and learn() with "
                 "reset_num_timesteps=False goes on after model.set_env() with new environments."
             ) from error
         except BaseException:
@@ -183,9 +194,9 @@ class ExplorationVecEnv(VecEnvWrapper):
     def _explore(self, envs: np.ndarray) -> np.ndarray:
         """:return: C's actions for some environments, within [-1, 1]; uniform while C has not learned anything yet"""
         if self.challenger.trained_updates == 0:
-            return np.random.uniform(-1, 1, size=(len(envs), *self.action_space.shape)).astype(np.float32)
+            return np.random.uniform(-1, 1, size=(len(envs), *self._low.shape)).astype(np.float32)
         self._catch_up(envs)
-        return self.challenger.act(self._select(envs)).reshape(len(envs), *self.action_space.shape)
+        return self.challenger.act(self._latent.select(th.as_tensor(envs))).reshape(len(envs), *self._low.shape)
 
     # ------------------------------------------------------------------ C's latent state
 
@@ -201,7 +212,7 @@ class ExplorationVecEnv(VecEnvWrapper):
     def _start_episode(self, env_idx: int, obs: dict[str, np.ndarray]) -> None:
         self._pending[env_idx].clear()  # what came before an is_first row doesn't matter
         self._unit_steps[env_idx] = 0
-        self._remember(env_idx, obs, np.zeros(self.action_space.shape, dtype=np.float32), is_first=True)
+        self._remember(env_idx, obs, np.zeros(self._low.shape, dtype=np.float32), is_first=True)
 
     def _remember(self, env_idx: int, obs: dict[str, np.ndarray], action: np.ndarray, is_first: bool) -> None:
         state = {key: np.array(obs[key][env_idx]) for key in self.challenger.keys}
@@ -212,65 +223,47 @@ class ExplorationVecEnv(VecEnvWrapper):
     def _catch_up(self, envs: np.ndarray) -> None:
         """Let the latent states of some environments follow what happened since the last time, all in one pass."""
         pending = [self._pending[env_idx] for env_idx in envs]
-        length = max(map(len, pending))
+        length = max(map(len, pending), default=0)
         if length == 0:
             return
         filler = next(rows[0] for rows in pending if rows)
-        columns = [rows + [filler] * (length - len(rows)) for rows in pending]
-        mask = np.array([[row < len(rows) for rows in pending] for row in range(length)])
-
-        def stacked(read: Callable[[_Row], Any]) -> np.ndarray:
-            return np.stack([np.stack([read(column[row]) for column in columns]) for row in range(length)])
-
+        padded = [rows + [filler] * (length - len(rows)) for rows in pending]
+        time_major = list(zip(*padded, strict=True))
+        index = th.as_tensor(envs)
         latent = self.challenger.follow(
-            self._select(envs),
-            {key: stacked(lambda row, key=key: row.observation[key]) for key in self.challenger.keys},
-            stacked(lambda row: row.action).reshape(length, len(envs), -1),
-            stacked(lambda row: row.is_first),
-            mask,
+            self._latent.select(index),
+            {key: np.array([[r.observation[key] for r in row] for row in time_major]) for key in self.challenger.keys},
+            np.array([[r.action.ravel() for r in row] for row in time_major]),
+            np.array([[r.is_first for r in row] for row in time_major]),
+            np.arange(length)[:, None] < np.array([len(rows) for rows in pending]),
         )
         for whole, part in zip(self._latent, latent, strict=True):
-            whole[th.as_tensor(envs)] = part
+            whole[index] = part
         for rows in pending:
             rows.clear()
-
-    def _select(self, envs: np.ndarray) -> Any:
-        return type(self._latent)(*(tensor[th.as_tensor(envs)] for tensor in self._latent))
 
     # ------------------------------------------------------------------ actions and checks
 
     def _scale(self, actions: np.ndarray) -> np.ndarray:
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        return (2.0 * (actions - low) / (high - low) - 1.0).astype(np.float32)
+        return (2.0 * (actions - self._low) / (self._high - self._low) - 1.0).astype(np.float32)
 
     def _unscale(self, scaled: np.ndarray) -> np.ndarray:
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        return low + 0.5 * (scaled + 1.0) * (high - low)
+        return self._low + 0.5 * (scaled + 1.0) * (self._high - self._low)
 
     def _check_finite(self, obs: dict[str, np.ndarray], rewards: np.ndarray, dones: np.ndarray, infos: Any) -> None:
         """NaN spreads from one transition into every network within an update: stop before it is stored."""
-        for env_idx in np.flatnonzero(~np.isfinite(rewards)):
-            raise ValueError(
-                f"Environment {env_idx} gave a reward of {rewards[env_idx]} at step {self._n_steps} of this learn(): rewards must "
-                "be finite. stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
-            )
         for env_idx in range(self.num_envs):
+            if not np.isfinite(rewards[env_idx]):
+                raise ValueError(
+                    f"Environment {env_idx} gave a reward of {rewards[env_idx]} at step {self._n_steps} of this learn(): "
+                    "rewards must be finite. stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
+                )
             last = infos[env_idx].get("terminal_observation") if dones[env_idx] else None
             for key, array in obs.items():
                 for value in (array[env_idx],) if last is None else (array[env_idx], last[key]):
                     if value.dtype.kind == "f" and not np.isfinite(value).all():
                         raise ValueError(
-                            f"Environment {env_idx} gave NaN or infinite values in observation {key!r} at step {self._n_steps} of "
-                            "this learn(). stable_baselines3.common.vec_env.VecCheckNan helps to find where they come from."
+                            f"Environment {env_idx} gave NaN or infinite values in observation {key!r} at step "
+                            f"{self._n_steps} of this learn(). stable_baselines3.common.vec_env.VecCheckNan helps to find "
+                            "where they come from."
                         )
-
-
-class _Row:
-    """A state that C's latent state has yet to follow, with the action that led to it."""
-
-    __slots__ = ("action", "is_first", "observation")
-
-    def __init__(self, observation: dict[str, np.ndarray], action: np.ndarray, is_first: bool):
-        self.observation = observation
-        self.action = action
-        self.is_first = is_first

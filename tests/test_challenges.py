@@ -34,7 +34,9 @@ def test_statistics_are_means_of_magnitudes():
     assert c.update([-2.0, 2.0], [-1.0, 1.0]) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("values, reference", [([0.0, 0.0], [1.0]), ([1.0], [0.0]), ([np.nan], [1.0]), ([1.0], [np.inf]), ([], [1.0]), ([1.0], [])])
+@pytest.mark.parametrize(
+    "values, reference", [([0.0, 0.0], [1.0]), ([1.0], [0.0]), ([np.nan], [1.0]), ([1.0], [np.inf]), ([], [1.0]), ([1.0], [])]
+)
 def test_unusable_statistics_leave_the_coefficient_alone(values, reference):
     c = DynamicCoefficient(target_ratio=1.0, initial=3.0, calibrate=False)
     assert c.update(values, reference) == 3.0
@@ -43,7 +45,10 @@ def test_unusable_statistics_leave_the_coefficient_alone(values, reference):
     assert calibrating.update([2.0], [4.0]) == 2.0, "an unusable call must not use the calibration up"
 
 
-@pytest.mark.parametrize("kwargs", [dict(low=0.9, high=1.1, factor=1.2), dict(low=1.1, high=1.0), dict(factor=1.0), dict(low=0.0), dict(initial=0.0)])
+@pytest.mark.parametrize(
+    "kwargs",
+    [dict(low=0.9, high=1.1, factor=1.2), dict(low=1.1, high=1.0), dict(factor=1.0), dict(low=0.0), dict(initial=0.0)],
+)
 def test_settings_that_cannot_settle_are_refused(kwargs):
     with pytest.raises(ValueError):
         DynamicCoefficient(target_ratio=1.0, **kwargs)
@@ -165,7 +170,16 @@ def test_a_tolerance_that_always_rejects_stays_finite():
     assert tolerance.value == Tolerance.MAX
 
 
-@pytest.mark.parametrize("kwargs", [dict(gamma=1.0), dict(target_acceptance=0.0), dict(target_acceptance=1.0), dict(novelty_tolerance=-1), dict(reward_memory_decay=1.0)])
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(gamma=1.0),
+        dict(target_acceptance=0.0),
+        dict(target_acceptance=1.0),
+        dict(novelty_tolerance=-1),
+        dict(reward_memory_decay=1.0),
+    ],
+)
 def test_filter_arguments(kwargs):
     with pytest.raises(ValueError):
         ChallengeFilter(**kwargs)
@@ -209,7 +223,9 @@ def test_settled_coefficients_meet_the_targets_of_the_report(calibrate):
     )
     ratios = []
     for round_ in range(800):
-        evaluation = Evaluation(rng.gamma(4.0, 0.01, 50), rng.gamma(4.0, 2.0, 50), np.linspace(0, 30, 51)[:, None] * np.ones((1, 8)))
+        evaluation = Evaluation(
+            rng.gamma(4.0, 0.01, 50), rng.gamma(4.0, 2.0, 50), np.linspace(0, 30, 51)[:, None] * np.ones((1, 8))
+        )
         p = curator.propose(rng.gamma(4.0, 0.1, 50), evaluation)
         if p.accepted and round_ > 400:
             a, counted = p.artificial, slice(p.first, None)

@@ -127,7 +127,7 @@ class ChallengeCurator:
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """All dynamic quantities by the report's names, as they are now (the reward memory is nan before the first trajectory)."""
+        """All dynamic quantities by the report's names, as they are now; no reward memory yet is nan."""
         memory = self.filter.reward_memory
         return {
             "c": self.quality.c.value,
@@ -145,7 +145,8 @@ class ChallengeCurator:
 def _checked(rewards: np.ndarray, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Everything as float64 arrays of the right shapes, or a ValueError that says which one is wrong."""
     rewards, disagreement, kl, embeddings = (
-        np.asarray(array, dtype=np.float64) for array in (rewards, evaluation.disagreement, evaluation.kl, evaluation.embeddings)
+        np.asarray(array, dtype=np.float64)
+        for array in (rewards, evaluation.disagreement, evaluation.kl, evaluation.embeddings)
     )
     n_steps = len(rewards)
     for name, array, rows, ndim in (

@@ -18,7 +18,8 @@ class ArtificialRewards:
     """
     The rewards r' of one challenge, and the terms that they consist of, each times its coefficient, before halving.
 
-    All arrays have the shape ``(length of the challenge,)`` and ``total = scale * (extrinsic + exploration + embedding + step)``.
+    All arrays have the shape ``(length of the challenge,)``;
+    ``total = scale * (extrinsic + exploration + embedding + step)``.
     """
 
     total: np.ndarray

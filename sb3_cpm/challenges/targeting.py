@@ -48,12 +48,12 @@ class DynamicCoefficient:
             raise ValueError(f"target_ratio must be a positive number, got {target_ratio}")
         if not factor > 1:
             raise ValueError(f"factor (lambda) must be greater than 1, got {factor}; the report uses 1.1 to 1.5")
-        if not (0 < low < high and low * factor < high / factor):
+        if not 0 < low < high:
+            raise ValueError(f"Tolerances must satisfy 0 < low < high, got low={low}, high={high}")
+        if not low * factor < high / factor:
             raise ValueError(
                 f"Tolerances low={low}, high={high} with factor={factor} oscillate: low * factor = {low * factor:.3g} must be "
-                f"below high / factor = {high / factor:.3g}. Widen the interval or use a factor below {np.sqrt(high / low):.3g}."
-                if 0 < low < high
-                else f"Tolerances must satisfy 0 < low < high, got low={low}, high={high}"
+                f"below high / factor = {high / factor:.3g}. Widen the interval or use a factor below {(high / low) ** 0.5:.3g}"
             )
         if not MIN_COEFFICIENT <= initial <= MAX_COEFFICIENT:
             raise ValueError(f"initial must lie in [{MIN_COEFFICIENT}, {MAX_COEFFICIENT}], got {initial}")

@@ -1,0 +1,353 @@
+"""The whole method through stock SB3: two lines of user code, save and load, seeds, several environments, bad input."""
+
+import os
+import signal
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from sb3_contrib import TQC, CrossQ
+from stable_baselines3 import DQN, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetPolicy
+from sb3_cpm.callbacks import without_exploration
+from sb3_cpm.envs.wrappers import DictObservation
+from sb3_cpm.exploration import ExplorationVecEnv
+
+TINY = dict(
+    batch_size=4, sequence_length=12, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=16, hidden_size=16, head_units=16,
+    actor_units=16, critic_units=16, horizon=4, imagination_starts=8,
+)  # fmt: skip
+
+
+def make_callback(**kwargs):
+    return ChallengerCallback(**{**dict(train_freq=10, challenger_kwargs=TINY), **kwargs})
+
+
+def toy(keys=("state",), n_envs=1, **kwargs):
+    return make_vec_env("sb3_cpm.envs.toy:CPMToy-v0", n_envs=n_envs, seed=0, env_kwargs=dict(keys=keys), **kwargs)
+
+
+def make_model(env=None, model_class=SAC, policy="MultiInputPolicy", buffer_kwargs=None, **kwargs):
+    arguments = dict(
+        learning_starts=100, batch_size=16, buffer_size=2000, seed=0, device="cpu", policy_kwargs=dict(net_arch=[16])
+    )
+    return model_class(
+        policy,
+        toy() if env is None else env,
+        replay_buffer_class=CPMBuffer,
+        replay_buffer_kwargs=buffer_kwargs or {},
+        **{**arguments, **kwargs},
+    )
+
+
+LENIENT = dict(filter_kwargs=dict(novelty_tolerance=1e5, relevance_tolerance=1e5))
+
+
+@pytest.mark.parametrize("model_class", [SAC, TD3, TQC])
+def test_stock_algorithms(model_class):
+    model = make_model(model_class=model_class, buffer_kwargs=LENIENT)
+    callback = make_callback()
+    env = model.env
+    model.learn(400, callback=callback)
+    assert model.env is env, "the wrapper is taken off again"
+    assert callback.challenger.trained_updates == pytest.approx(30, abs=1)
+    buffer = model.replay_buffer
+    assert buffer.counters.proposed == 6, "episodes that end before C's first update are not judged"
+    assert buffer.counters.kept >= len(buffer.challenges) > 0
+    assert 0.05 < callback.explored_share < 0.9
+
+
+@pytest.mark.parametrize("keys", [("camera",), ("camera", "state"), ("camera", "pointcloud", "state")])
+def test_images_vectors_and_both(keys):
+    """P needs no image network of its own when there is something else to look at."""
+    if keys == ("camera",):  # SB3's NatureCNN refuses 32x32 images, so P gets the pixels flat
+        policy_kwargs = dict(net_arch=[16], normalize_images=False)
+        env = make_vec_env(lambda: FlatCopy(gym.make("CPMToy-v0", keys=keys)), seed=0)
+        model = make_model(
+            env,
+            buffer_kwargs=dict(player_keys=["flat"], **LENIENT),
+            policy_kwargs=dict(**policy_kwargs, features_extractor_class=FlatOnly),
+        )
+        callback = make_callback(keys=["camera"])
+    else:
+        model = make_model(toy(keys), policy=PointNetPolicy, buffer_kwargs=LENIENT)
+        callback = make_callback()
+    model.learn(250, callback=callback)
+    assert callback.challenger.keys == tuple(key for key in ("camera", "state") if key in keys)
+    if keys != ("camera",):
+        expected = tuple(key for key in ("pointcloud", "state") if key in keys)
+        assert set(model.replay_buffer.player_keys) == set(expected), "no camera image is moved for P"
+    assert model.replay_buffer.counters.proposed > 0
+
+
+class FlatCopy(gym.ObservationWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Dict(
+            {"camera": env.observation_space["camera"], "flat": spaces.Box(0, 1, (64,), np.float32)}
+        )
+
+    def observation(self, observation):
+        pixels = observation["camera"][::4, ::4, 0].astype(np.float32).ravel() / 255
+        return {**observation, "flat": pixels}
+
+
+def _flat_only():
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+    class FlatOnlyExtractor(BaseFeaturesExtractor):
+        player_keys = ("flat",)
+
+        def __init__(self, observation_space):
+            super().__init__(observation_space, 64)
+
+        def forward(self, observations):
+            return observations["flat"]
+
+    return FlatOnlyExtractor
+
+
+FlatOnly = _flat_only()
+
+
+@pytest.mark.parametrize("vec_env_class", [None, SubprocVecEnv])
+def test_three_environments(vec_env_class):
+    model = make_model(toy(n_envs=3, vec_env_cls=vec_env_class), learning_starts=150, buffer_kwargs=LENIENT, train_freq=4)
+    callback = make_callback(unit="segment")
+    model.learn(750, callback=callback)
+    assert model.replay_buffer.counters.proposed == 12  # 3 x 5 episodes, the first of each before C knows anything
+    assert {episode.env_idx for episode in model.replay_buffer.episodes} == {0, 1, 2}
+    assert model.replay_buffer.challenges
+    model.env.close()
+
+
+class ExecutedActions(gym.Wrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.executed = []
+
+    def step(self, action):
+        self.executed.append(np.array(action))
+        return self.env.step(action)
+
+
+def test_d_stores_what_was_executed():
+    env = ExecutedActions(DictObservation(gym.make("Pendulum-v1")))  # actions within [-2, 2]
+    model = make_model(env, learning_starts=200)
+    model.learn(500, callback=make_callback(decay="constant", decay_kwargs=dict(start=0.5)))
+    stored = model.replay_buffer.actions[:500, 0] * 2
+    np.testing.assert_allclose(stored, np.array(env.executed), atol=1e-5)
+
+
+def test_same_seed_same_run_and_another_seed_another():
+    def run(seed):
+        model = make_model(toy(("camera", "state")), policy=PointNetPolicy, seed=seed, buffer_kwargs=LENIENT)
+        callback = make_callback()
+        model.learn(300, callback=callback)
+        weights = th.cat([p.flatten() for p in (*model.policy.parameters(), *callback.challenger.world_model.parameters())])
+        return weights.detach(), model.replay_buffer.coefficients, model.replay_buffer.rewards.copy()
+
+    (weights, coefficients, rewards), (same_weights, same_coefficients, same_rewards) = run(3), run(3)
+    assert th.equal(weights, same_weights) and coefficients == same_coefficients
+    np.testing.assert_array_equal(rewards, same_rewards)
+    assert not th.equal(weights, run(4)[0])
+
+
+def test_save_load_continue(tmp_path):
+    model = make_model(buffer_kwargs=LENIENT)
+    callback = make_callback()
+    model.learn(400, callback=callback)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    callback.save(tmp_path / "challenger.pt")
+    proposed, coefficients = model.replay_buffer.counters.proposed, model.replay_buffer.coefficients
+
+    loaded = SAC.load(tmp_path / "model", env=toy(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.coefficients == coefficients
+    assert len(loaded.replay_buffer.challenges) == len(model.replay_buffer.challenges)
+    resumed = make_callback(load_path=tmp_path / "challenger.pt")
+    loaded.learn(200, callback=resumed, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 600
+    assert resumed.challenger.trained_updates > callback.challenger.trained_updates
+    assert loaded.replay_buffer.counters.proposed > proposed
+
+
+def test_a_second_learn_goes_on_with_the_same_challenger():
+    model, callback = make_model(), make_callback()
+    model.learn(200, callback=callback)
+    challenger, updates = callback.challenger, callback.challenger.trained_updates
+    model.learn(130, callback=callback)
+    assert callback.challenger is challenger and challenger.trained_updates > updates
+    lengths = [episode.length for episode in model.replay_buffer.episodes]
+    assert lengths == [50] * 6, "130 steps leave 30 of an unfinished episode"
+    with pytest.raises(ValueError, match="other spaces"):
+        make_model(toy(("camera", "state")), policy=PointNetPolicy).learn(10, callback=callback)
+
+
+def test_vecnormalize():
+    env = VecNormalize(toy(), norm_obs_keys=["state"])
+    model = make_model(env, buffer_kwargs=LENIENT)
+    model.learn(300, callback=make_callback())
+    assert np.abs(model.replay_buffer.observations["state"]).max() <= 1, "D holds what the environment gave"
+    assert model.get_vec_normalize_env() is env and model.env is env
+
+
+def test_row_mix_with_evaluation_progress_bar_and_tensorboard(tmp_path):
+    model = make_model(buffer_kwargs=dict(mix="row", **LENIENT))
+    logger = configure(str(tmp_path), ["csv", "tensorboard"])
+    model.set_logger(logger)
+    evaluation = EvalCallback(toy(), n_eval_episodes=1, eval_freq=150, verbose=0)
+    model.learn(420, callback=[make_callback(), evaluation], progress_bar=True)
+    logger.close()
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
+    names = {"rollout/exploration_rate", "challenger/world_model_loss", "challenger/exp_scale"}
+    names |= {f"challenge/{name}" for name in ("kept", "c_emb", "w3", "reward_memory", "acceptance_novel")}
+    assert names <= set(header)
+    assert any(path.name.startswith("events.out.tfevents") for path in tmp_path.iterdir())
+
+
+class RaisesAt(BaseCallback):
+    def __init__(self, step, action):
+        super().__init__()
+        self.step, self.action = step, action
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            self.action()
+        return True
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals reach the main thread")
+def test_ctrl_c_takes_the_wrapper_off_and_loses_nothing(tmp_path):
+    model, callback = make_model(), make_callback()
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(400, callback=[callback, RaisesAt(230, lambda: os.kill(os.getpid(), signal.SIGINT))])
+    assert not isinstance(model.env, ExplorationVecEnv)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert len(model.replay_buffer.episodes) == 4
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    callback.save(tmp_path / "challenger.pt")
+    model.learn(50, callback=callback, reset_num_timesteps=False)
+    assert isinstance(without_exploration(model.env), type(model.env))
+
+
+def test_an_environment_that_dies_takes_the_wrapper_off():
+    class Dies(gym.Wrapper):
+        n = 0
+
+        def step(self, action):
+            self.n += 1
+            if self.n == 120:
+                raise ConnectionResetError
+            return self.env.step(action)
+
+    model = make_model(make_vec_env(lambda: Dies(gym.make("CPMToy-v0", keys=("state",)))))
+    with pytest.raises(RuntimeError, match="died at step 120"):
+        model.learn(400, callback=make_callback())
+    assert not isinstance(model.env, ExplorationVecEnv)
+    assert len(model.replay_buffer.episodes) == 2
+    model.set_env(toy())
+    model.learn(100, callback=make_callback(), reset_num_timesteps=False)
+    assert [episode.length for episode in model.replay_buffer.episodes][:4] == [50, 50, 19, 50]
+
+
+def test_time_table_covers_the_run():
+    callback = make_callback()
+    make_model().learn(250, callback=callback)
+    expected = {"simulate+render", "C acts", "C evaluates", "C trains", "P trains", "P acts", "buffer", "bookkeeping"}
+    assert set(callback.stopwatch.seconds) == expected
+    assert all(seconds > 0 for seconds in callback.stopwatch.seconds.values())
+    assert not callback.stopwatch._open
+
+
+# ---------------------------------------------------------------------- bad input, before any training
+
+
+def never_step(env):
+    def step(*args):
+        raise AssertionError("a step was taken")
+
+    env.step_wait = step
+    return env
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: make_model("Pendulum-v1", policy="MlpPolicy"), "sb3_cpm.envs.DictObservation"),
+        (lambda: CrossQ("MlpPolicy", "Pendulum-v1", replay_buffer_class=CPMBuffer), "CrossQ has none"),
+        (lambda: CrossQ("MlpPolicy", "Pendulum-v1").learn(10, callback=make_callback()), "CrossQ has no such policy"),
+        (lambda: DQN("MlpPolicy", "CartPole-v1").learn(10, callback=make_callback()), "Dict observation space"),
+        (lambda: PPO("MultiInputPolicy", never_step(toy())).learn(10, callback=make_callback()), "off-policy"),
+        (
+            lambda: SAC("MultiInputPolicy", never_step(toy())).learn(10, callback=make_callback()),
+            "replay_buffer_class=CPMBuffer",
+        ),
+        (
+            lambda: make_model(never_step(toy()), learning_starts=49).learn(10, callback=make_callback()),
+            "learning_starts=50 or more",
+        ),
+        (lambda: make_model(never_step(toy()), buffer_size=60).learn(10, callback=make_callback()), "buffer_size=100 or more"),
+        (
+            lambda: make_model(never_step(toy(n_envs=3)), learning_starts=100).learn(10, callback=make_callback()),
+            "learning_starts=150",
+        ),
+        (lambda: make_model(buffer_kwargs=dict(challenge_ratio=1.5)), r"\[0, 1\], got 1.5"),
+        (lambda: make_callback(decay="expnential"), "Unknown decay"),
+        (lambda: make_callback(unit="minute"), "unit must be"),
+        (lambda: make_callback(train_freq=0), "train_freq"),
+        (lambda: make_callback(segment_length=0), "segment_length"),
+        (lambda: make_model(never_step(toy())).learn(10, callback=make_callback(preset="smal")), "small|default"),
+        (lambda: make_model(never_step(toy())).learn(10, callback=make_callback(keys=["stat"])), "stat"),
+        (lambda: make_model(never_step(toy())).learn(10, callback=make_callback(load_path="nowhere.pt")), "nowhere.pt"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_discrete_actions():
+    class Discrete(gym.Wrapper):
+        action_space = spaces.Discrete(3)
+
+    with pytest.raises(ValueError, match="continuous actions"):
+        DQN("MultiInputPolicy", Discrete(gym.make("CPMToy-v0", keys=("state",))), replay_buffer_class=CPMBuffer)
+
+
+def test_images_of_unequal_size():
+    class TwoCameras(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            big = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+            self.observation_space = spaces.Dict({**env.observation_space.spaces, "big": big})
+
+        def observation(self, observation):
+            return {**observation, "big": np.zeros((64, 64, 3), np.uint8)}
+
+    model = make_model(TwoCameras(gym.make("CPMToy-v0")), policy=PointNetPolicy)
+    with pytest.raises(ValueError, match=r"(?s)camera.*big|big.*camera"):
+        model.learn(10, callback=make_callback())
+
+
+def test_the_buffer_without_its_callback():
+    with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
+        make_model().learn(10)
+
+
+def test_saving_before_there_is_a_challenger():
+    with pytest.raises(RuntimeError, match="learn"):
+        make_callback().save("challenger.pt")
+    assert isinstance(CallbackList([make_callback()]), BaseCallback)
