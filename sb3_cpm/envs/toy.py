@@ -117,8 +117,8 @@ class ToyEnv(gym.Env):
         if success:
             return 1.0
         if self.task == "reach":
-            return 1 - float(np.tanh(2 * self._distance(0, 1)))
-        return 1 - (float(np.tanh(2 * self._distance(0, 2))) + 2 * float(np.tanh(2 * self._distance(2, 1)))) / 3
+            return 1 - float(np.tanh(self._distance(0, 1)))
+        return 1 - (float(np.tanh(self._distance(0, 2))) + 2 * float(np.tanh(self._distance(2, 1)))) / 3
 
     def _observe(self) -> dict[str, np.ndarray]:
         observation: dict[str, np.ndarray] = {}

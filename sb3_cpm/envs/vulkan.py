@@ -90,9 +90,11 @@ def activate_private() -> bool:
 def forget_failed_opencv() -> None:
     """
     Stable-Baselines3 tries to import OpenCV and lives without it. Where OpenCV's system libraries are missing, the attempt
-    leaves OpenCV's own folder on ``sys.path``, whose ``typing`` hides Python's: from then on no worker process starts.
+    leaves OpenCV's own folder on ``sys.path``, whose ``typing`` hides Python's, so that no worker process starts; and a
+    mark that forbids another attempt, which would succeed with the private libraries.
     """
     if "cv2" not in sys.modules:
+        vars(sys).pop("OpenCV_LOADER", None)
         sys.path[:] = [folder for folder in sys.path if os.path.basename(folder) != "cv2"]
 
 
