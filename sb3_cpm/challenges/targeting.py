@@ -53,7 +53,8 @@ class DynamicCoefficient:
         if not low * factor < high / factor:
             raise ValueError(
                 f"Tolerances low={low}, high={high} with factor={factor} oscillate: low * factor = {low * factor:.3g} must be "
-                f"below high / factor = {high / factor:.3g}. Widen the interval or use a factor below {(high / low) ** 0.5:.3g}"
+                f"below high / factor = {high / factor:.3g}. Widen the interval, or use a factor below "
+                f"{(high / low) ** 0.5:.3g}."
             )
         if not MIN_COEFFICIENT <= initial <= MAX_COEFFICIENT:
             raise ValueError(f"initial must lie in [{MIN_COEFFICIENT}, {MAX_COEFFICIENT}], got {initial}")
