@@ -16,7 +16,7 @@ KEYS = ("camera", "pointcloud", "state")
 IMAGE_SIZE = 32
 STEP_LENGTH = 0.1
 BODY_RADIUS = 0.12
-SUCCESS_DISTANCE = 0.1
+SUCCESS_DISTANCE = 0.15
 BACKGROUND = np.array([235, 235, 230], dtype=np.uint8)
 ROBOT_COLOUR = np.array([40, 90, 200], dtype=np.uint8)
 PUCK_COLOUR = np.array([230, 120, 30], dtype=np.uint8)

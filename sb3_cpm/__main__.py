@@ -1,0 +1,140 @@
+"""
+The command line: ``python -m sb3_cpm train | doctor | setup-rendering``.
+
+Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
+machine where something is missing.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import MISSING, Field, fields
+from typing import Any
+
+from sb3_cpm import __version__
+from sb3_cpm.run.settings import ALGORITHMS, TrainSettings, field_documentation
+
+EPILOG = """examples:
+  python -m sb3_cpm train                                       CPM-SAC on PickCube-v1, the defaults
+  python -m sb3_cpm train --env CPMToy-v0 --steps 3000          a small task that needs no renderer
+  python -m sb3_cpm train --env Pendulum-v1 --algorithm td3     any gymnasium task with continuous actions
+  python -m sb3_cpm train --env-kwargs image_size=64 cameras=[base_camera]
+"""
+CHOICES = {"algorithm": ALGORITHMS, "unit": ("step", "segment", "episode")}
+TYPES = {"steps": int, "gamma": float, "tau": float, "buffer_size": int, "learning_starts": int}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param arguments: of the command line, without the program's name; None for those of this process
+    :return: exit status: 0 if all is well, 1 for errors that a message explains, 130 after Ctrl-C
+    """
+    options = vars(make_parser().parse_args(arguments))
+    command = options.pop("command")
+    try:
+        return command(**options)
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """:return: the parser of all commands"""
+    parser = argparse.ArgumentParser(prog="sb3-cpm", description="CPM: a challenger and a player for Stable-Baselines3.")
+    parser.add_argument("--version", action="version", version=f"sb3_cpm {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="command")
+
+    train = commands.add_parser(
+        "train",
+        help="train on a task and leave a folder of results",
+        description="Train a player and its challenger, and leave a folder with models, curves, gallery and video.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    train.set_defaults(command=_train)
+    documentation = field_documentation()
+    for setting in fields(TrainSettings):
+        _add_option(train, setting, documentation[setting.name].replace("%", "%%"))
+
+    doctor = commands.add_parser("doctor", help="what works on this machine, and the cure for what doesn't")
+    doctor.set_defaults(command=_doctor)
+
+    rendering = commands.add_parser(
+        "setup-rendering",
+        help="find a Vulkan device that can render, or install software Vulkan",
+        description="Find a Vulkan device that ManiSkill can render with; where there is none, install software Vulkan: for "
+        "the system as root, privately otherwise. Can be repeated.",
+    )
+    rendering.add_argument("--private", action="store_true", help="install privately even as root")
+    rendering.set_defaults(command=_setup_rendering)
+    return parser
+
+
+def _add_option(parser: argparse.ArgumentParser, setting: "Field[Any]", text: str) -> None:
+    """An option for a setting of :class:`TrainSettings`, with its documentation."""
+    flag = "--" + setting.name.replace("_", "-")
+    if setting.default_factory is not MISSING:  # the dicts
+        parser.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
+        return
+    default = setting.default
+    shown = "" if default is None else f" (default: {default})"
+    if isinstance(default, bool) or setting.name == "progress_bar":
+        parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=default, help=text + shown)
+        return
+    kind = TYPES.get(setting.name, str if default is None else type(default))
+    choices = CHOICES.get(setting.name)
+    metavar = None if choices else kind.__name__.upper()
+    parser.add_argument(flag, type=kind, default=default, choices=choices, metavar=metavar, help=text + shown)
+
+
+class _KeyValues(argparse.Action):
+    """``a=1 b=[x,y]`` becomes ``{"a": 1, "b": ["x", "y"]}``; values are read as YAML."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        import yaml
+
+        found = dict(getattr(namespace, self.dest))
+        for pair in values or ():
+            name, sign, value = str(pair).partition("=")
+            if not sign or not name:
+                parser.error(f"{option_string} {pair}: expected NAME=VALUE")
+            try:
+                found[name] = yaml.safe_load(value)
+            except yaml.YAMLError as error:
+                parser.error(f"{option_string} {pair}: the value is not YAML ({error})")
+        setattr(namespace, self.dest, found)
+
+
+def _train(**settings: Any) -> int:
+    try:
+        from sb3_cpm.run.training import train
+    except ImportError as error:
+        raise RuntimeError(f'Training needs a package that is missing ({error}): pip install "sb3_cpm[run]"') from error
+    train(TrainSettings(**settings))
+    return 0
+
+
+def _doctor() -> int:
+    from sb3_cpm.doctor import run_doctor
+
+    return run_doctor()
+
+
+def _setup_rendering(private: bool) -> int:
+    from sb3_cpm.envs.rendering import setup_rendering
+
+    return setup_rendering(private=private)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,311 @@
+"""
+One run from settings to a folder of results.
+
+Whatever ends it (the last step, Ctrl-C, an exception), everything up to that moment is written and the environments are
+closed. SB3 does the training; this module only prepares, watches and tidies up.
+"""
+
+import contextlib
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
+from sb3_cpm.run import folder as run_folder
+from sb3_cpm.run import plots
+from sb3_cpm.run.environment import make_env, make_vec_env, max_episode_steps
+from sb3_cpm.run.evaluation import FIRST_SEED, Evaluator, play_episode, success_rate
+from sb3_cpm.run.gallery import challenge_gallery
+from sb3_cpm.run.recorder import Recorder
+from sb3_cpm.run.settings import TrainSettings
+from sb3_cpm.run.summary import Summary, complete_times, peak_memory_gb
+from sb3_cpm.run.video import write_video
+
+#: Trajectories in the challenge gallery.
+N_SHOTS = 6
+
+
+def train(settings: TrainSettings | None = None, callback: BaseCallback | None = None, **changes: Any) -> Summary:
+    """
+    Train CPM on an environment and leave a folder of results.
+
+    >>> train(env="CPMToy-v0", steps=2000, run_folder="runs/toy").success  # doctest: +SKIP
+    1.0
+
+    :param settings: of the run; None for ``TrainSettings(**changes)``
+    :param callback: a further SB3 callback, called after those of the run
+    :param changes: settings by name, when ``settings`` is None
+    :return: the numbers of the run; they are also in its folder, as summary.json
+    :raises ValueError: for settings that cannot work, before anything is trained
+    """
+    if settings is not None and changes:
+        raise ValueError(f"Give either settings or single values, not both: {sorted(changes)}")
+    return Run((settings or TrainSettings(**changes)).resolved()).execute(callback)
+
+
+class Run:
+    """
+    Environments, model, callbacks and folder of one run.
+
+    :param settings: without None where a task has defaults of its own
+    :raises ValueError: for settings that cannot work; nothing is left behind then
+    """
+
+    def __init__(self, settings: TrainSettings) -> None:
+        self.settings = settings
+        self.started = time.perf_counter()
+        self.title = f"CPM-{settings.algorithm.upper()} on {settings.env}, seed {settings.seed}"
+        with contextlib.ExitStack() as undo:
+            self.env = make_vec_env(settings.env, settings.n_envs, settings.seed, **settings.env_kwargs)
+            undo.callback(self.env.close)
+            self.model = make_model(settings, self.env)
+            self.evaluation_env = make_env(settings.env, render_mode="rgb_array", **settings.env_kwargs)
+            undo.callback(self.evaluation_env.close)
+            self.challenger = make_challenger(settings)
+            self.folder = run_folder.make_run_folder(settings)
+            undo.pop_all()
+        self._close_actions: list[Callable[[], Any]] = []
+        self._describe()
+
+    def _describe(self) -> None:
+        run_folder.write_yaml(self.folder / "config.yml", self.settings.as_dict())
+        run_folder.write_yaml(self.folder / "versions.yml", run_folder.versions())
+        formats = [
+            make_output_format("csv", str(self.folder)),
+            make_output_format("tensorboard", str(self.folder / "tensorboard")),
+        ]
+        self.model.set_logger(Logger(str(self.folder), formats))
+        total = self.settings.steps or 0
+        self.recorder = Recorder(self.folder, self.challenger, total)
+        self.evaluator = Evaluator(
+            self.evaluation_env, self.folder, self.challenger, total, self.settings.evaluations, self.settings.eval_episodes
+        )
+
+    def execute(self, callback: BaseCallback | None = None) -> Summary:
+        """
+        Train, then write everything; an exception goes on after everything is written.
+
+        :param callback: a further callback
+        :return: the numbers of the run
+        """
+        outcome = "finished"
+        callbacks = [self.challenger, self.recorder, self.evaluator, *([callback] if callback else [])]
+        say(f"{self.title}: {self.settings.steps} steps, results go to {self.folder}")
+        try:
+            self.model.learn(
+                self.settings.steps or 0,
+                callback=callbacks,
+                log_interval=2,
+                progress_bar=self._progress_bar(),
+            )
+            self.evaluator.at_end()
+        except BaseException as error:
+            outcome = _describe_end(error)
+            raise
+        finally:
+            with _no_second_interrupt():
+                summary = self._finish(outcome)
+        summary.show()
+        return summary
+
+    def _progress_bar(self) -> bool:
+        wanted = self.settings.progress_bar
+        return sys.stderr.isatty() if wanted is None else wanted
+
+    # ------------------------------------------------------------------ what is left behind
+
+    def _finish(self, outcome: str) -> Summary:
+        """Write everything and close the environments. What fails is told and doesn't keep the rest from being written."""
+        folder, finished = self.folder, outcome == "finished"
+        end = "Finished" if finished else f"{outcome} at step {self.model.num_timesteps}".capitalize()
+        say(f"{end}: writing everything to {folder}")
+        jobs: list[tuple[str, Callable[[], Any]]] = [
+            ("the model", lambda: self._save("model.zip", self.model.save)),
+            ("the challenger", self._save_challenger),
+            ("the replay buffer", lambda: self._save("replay_buffer.pkl", self.model.save_replay_buffer)),
+            ("the logs", self._close_logs),
+            ("the learning curve", lambda: plots.learning_curve(folder, self.title)),
+            ("the coefficients", lambda: plots.coefficients(folder, self.title)),
+            ("the challenge gallery", self._draw_gallery),
+        ]
+        if self.settings.video and finished:
+            jobs.append(("the video", self._film))
+        jobs += [("the environments", self.env.close), ("the evaluation environment", self.evaluator.close)]
+        with self.challenger.stopwatch.section("pictures and saving"):
+            for what, job in jobs:
+                _attempt(what, job)
+        summary = self._summary(outcome)
+        summary.write(folder)
+        return summary
+
+    def _save(self, name: str, save: Callable[[Path], None]) -> None:
+        with run_folder.atomic(self.folder / name) as temporary:
+            save(temporary)
+
+    def _save_challenger(self) -> None:
+        if self.challenger.challenger is not None:
+            self._save("challenger.pt", self.challenger.save)
+
+    def _close_logs(self) -> None:
+        self.model.logger.dump(self.model.num_timesteps)
+        self.model.logger.close()
+        self.recorder.close()
+
+    def _draw_gallery(self) -> None:
+        shots = self.recorder.shots.choose(N_SHOTS)
+        challenge_gallery(self.folder / "challenge_gallery.png", shots, f"Challenge gallery: {self.title}")
+
+    def _film(self) -> None:
+        frames: list[Any] = []
+        result = play_episode(self.model, self.evaluation_env, FIRST_SEED, frames)
+        write_video(self.folder, "evaluation", frames)
+        say(f"The video shows an evaluation episode with return {result.episode_return:.2f}")
+
+    def _summary(self, outcome: str) -> Summary:
+        counters = self.challenger.buffer.counters if isinstance(self.model.replay_buffer, CPMBuffer) else None
+        seconds = time.perf_counter() - self.started
+        times = complete_times(dict(self.challenger.stopwatch.seconds), seconds)
+        training = seconds - times.get("evaluation", 0.0) - times.get("pictures and saving", 0.0)
+        results = self.evaluator.results
+        first, last = (results[0][1], results[-1][1]) if results else (None, None)
+        challenger = self.challenger.challenger
+        return Summary(
+            title=self.title,
+            outcome=outcome,
+            steps=self.model.num_timesteps,
+            episodes=self.recorder.n_episodes,
+            seconds=seconds,
+            steps_per_second=self.model.num_timesteps / max(training, 1e-9),
+            first_success=None if first is None else success_rate(first),
+            success=None if last is None else success_rate(last),
+            first_return=None if first is None else _mean_return(first),
+            mean_return=None if last is None else _mean_return(last),
+            proposed=0 if counters is None else counters.proposed,
+            kept=0 if counters is None else counters.kept,
+            rejected_by={} if counters is None else dict(counters.rejected_by),
+            explored_share=self.recorder.explored_share,
+            challenger_updates=0 if challenger is None else challenger.trained_updates,
+            player_updates=self.model._n_updates,
+            time=times,
+            peak_memory_gb=peak_memory_gb(),
+            folder=str(self.folder),
+        )
+
+
+def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
+    """
+    The player: an unmodified SB3 algorithm with a :class:`CPMBuffer`.
+
+    :param settings: of the run
+    :param env: the training environments
+    """
+    limit = max_episode_steps(env) or 200
+    learning_starts = settings.learning_starts
+    if learning_starts is None:
+        learning_starts = 4 * limit * settings.n_envs
+    kwargs: dict[str, Any] = {
+        "buffer_size": settings.buffer_size,
+        "batch_size": settings.batch_size,
+        "learning_rate": settings.learning_rate,
+        "gamma": settings.gamma,
+        "tau": settings.tau,
+        "train_freq": settings.train_freq,
+        "gradient_steps": settings.gradient_steps,
+        "learning_starts": learning_starts,
+        "seed": settings.seed,
+        "device": settings.device,
+        **settings.model_kwargs,
+    }
+    kwargs["replay_buffer_class"] = CPMBuffer
+    kwargs["replay_buffer_kwargs"] = {"challenge_ratio": settings.challenge_ratio, **settings.buffer_kwargs}
+    policy, policy_kwargs = _policy(settings.algorithm, env)
+    kwargs["policy_kwargs"] = {**policy_kwargs, **settings.model_kwargs.get("policy_kwargs", {})}
+    return _algorithm(settings.algorithm)(policy, env, **kwargs)
+
+
+def _policy(algorithm: str, env: VecEnv) -> tuple[Any, dict[str, Any]]:
+    """PointNet (and vectors) for whatever has clouds or vectors; where there are only images, those are read."""
+    images_only = all(is_image_space(space) for space in env.observation_space.spaces.values())  # type: ignore[attr-defined]
+    extractor_kwargs = {"keys": list(env.observation_space.spaces)} if images_only else {}  # type: ignore[attr-defined]
+    if algorithm == "sac":
+        return PointNetPolicy, {"features_extractor_kwargs": extractor_kwargs}
+    return "MultiInputPolicy", {
+        "features_extractor_class": PointNetExtractor,
+        "features_extractor_kwargs": extractor_kwargs,
+    }
+
+
+def _algorithm(name: str) -> type[OffPolicyAlgorithm]:
+    if name == "sac":
+        return SAC
+    if name == "td3":
+        return TD3
+    try:
+        from sb3_contrib import TQC
+    except ImportError as error:
+        raise ValueError('algorithm="tqc" needs sb3-contrib: pip install "sb3_cpm[contrib]"') from error
+    return TQC
+
+
+def make_challenger(settings: TrainSettings) -> ChallengerCallback:
+    """
+    :param settings: of the run
+    :return: the callback that brings the challenger
+    """
+    kwargs = {
+        "preset": settings.preset,
+        "decay": settings.decay,
+        "unit": settings.unit,
+        "train_freq": settings.challenger_train_freq,
+        "gradient_steps": settings.challenger_gradient_steps,
+        **settings.callback_kwargs,
+    }
+    return ChallengerCallback(**kwargs)
+
+
+def say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _attempt(what: str, job: Callable[[], Any]) -> None:
+    try:
+        job()
+    except Exception:
+        print(f"Could not write or close {what}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+
+
+def _describe_end(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "stopped by Ctrl-C"
+    return f"ended by {type(error).__name__}: {error}"
+
+
+@contextlib.contextmanager
+def _no_second_interrupt() -> Iterator[None]:
+    """An impatient second Ctrl-C must not spoil what is being written."""
+    try:
+        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:  # not in the main thread, where no Ctrl-C arrives
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _mean_return(results: list[Any]) -> float:
+    return sum(result.episode_return for result in results) / len(results)
