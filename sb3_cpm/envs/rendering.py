@@ -7,6 +7,7 @@ process dies. So :func:`probe_renderer` tries it in a child process, :func:`setu
 probe fails (:mod:`sb3_cpm.envs.vulkan`), and :func:`ensure_renderer` is the fast part that every environment goes through.
 """
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -22,7 +23,6 @@ from typing import Any, NamedTuple
 
 from sb3_cpm.envs import vulkan
 
-CURE = "Run `python -m sb3_cpm setup-rendering` once: it installs software Vulkan, with or without root."
 SOFTWARE = ("llvmpipe", "swiftshader")
 """Parts of the device names of renderers that run on the CPU."""
 
@@ -49,11 +49,13 @@ class Probe(NamedTuple):
     What came of a trial in a child process.
 
     :param renderer: None if it failed
+    :param driver: the Vulkan driver's version, empty if it failed or Vulkan would not tell
     :param problem: why it failed, in one paragraph; empty if it did not
     :param seconds: how long it took
     """
 
     renderer: Renderer | None
+    driver: str
     problem: str
     seconds: float
 
@@ -77,10 +79,20 @@ def ensure_renderer() -> Renderer:
         vulkan.activate_private()
         # A worker thread pool for pictures of 32x32 costs more than it brings, all the more with several environments.
         os.environ.setdefault("LP_NUM_THREADS", "0")
-        _renderer, _ = _open_renderer()
+        try:
+            _renderer, _ = _open_renderer()
+        except RuntimeError as error:
+            raise RuntimeError(f"{error}. {cure()}") from error
         if _renderer.software:
             use_fast_shaders()
     return _renderer
+
+
+def cure() -> str:
+    """:return: what to do where SAPIEN does not render"""
+    if named := vulkan.named_drivers():
+        return f"The environment names a Vulkan driver that does not work: unset {named}"
+    return "Run `python -m sb3_cpm setup-rendering` once: it installs software Vulkan, with or without root"
 
 
 def _open_renderer() -> tuple[Renderer, Any]:
@@ -88,11 +100,11 @@ def _open_renderer() -> tuple[Renderer, Any]:
     try:
         import sapien
     except ImportError as error:  # a shared library is missing
-        raise RuntimeError(f"SAPIEN cannot be imported: {error}. {CURE}") from error
+        raise RuntimeError(f"SAPIEN cannot be imported: {error}") from error
     try:
         devices = device_names(sapien.render.get_device_summary())
     except RuntimeError as error:
-        raise RuntimeError(f"No usable Vulkan driver on this machine (SAPIEN says: {error}). {CURE}") from error
+        raise RuntimeError(f"No usable Vulkan driver on this machine (SAPIEN says: {error})") from error
     problem: Exception | None = None
     for backend, device in (("gpu", "cuda"), ("cpu", "cpu")):
         names = [name for name, is_cuda in devices if is_cuda == (backend == "gpu")]
@@ -105,7 +117,7 @@ def _open_renderer() -> tuple[Renderer, Any]:
             continue
         software = backend == "cpu" and any(word in name.lower() for name in names for word in SOFTWARE)
         return Renderer(backend, names[0], software), system
-    raise RuntimeError(f"SAPIEN can use none of {[name for name, _ in devices]} (it says: {problem}). {CURE}")
+    raise RuntimeError(f"SAPIEN can use none of {[name for name, _ in devices]} (it says: {problem})")
 
 
 def device_names(summary: str) -> list[tuple[str, bool]]:
@@ -197,16 +209,17 @@ def probe_renderer(use_private: bool = True, timeout: float = 180.0) -> Probe:
         )
     except subprocess.TimeoutExpired as error:
         stage = _stage(error.stdout.decode(errors="replace") if isinstance(error.stdout, bytes) else error.stdout or "")
-        return Probe(None, f"The trial hung for {timeout:g} s while it tried to {stage}.", timeout)
+        return Probe(None, "", f"The trial hung for {timeout:g} s while it tried to {stage}.", timeout)
     seconds = time.perf_counter() - start
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
-        return Probe(None, f"The trial process died of {name} while it tried to {_stage(child.stdout)}.", seconds)
+        return Probe(None, "", f"The trial process died of {name} while it tried to {_stage(child.stdout)}.", seconds)
     result = [line for line in child.stdout.splitlines() if line.startswith("{")]
     if child.returncode != 0 or not result:
         last = (child.stderr.strip().splitlines() or ["no message"])[-1]
-        return Probe(None, f"{last} (while it tried to {_stage(child.stdout)})", seconds)
-    return Probe(Renderer(**json.loads(result[-1])), "", seconds)
+        return Probe(None, "", f"{last} (while it tried to {_stage(child.stdout)})", seconds)
+    fields = json.loads(result[-1])
+    return Probe(Renderer(**fields["renderer"]), fields["driver"], "", seconds)
 
 
 def _stage(output: str) -> str:
@@ -244,7 +257,17 @@ def _probe(use_private: bool) -> None:
     red, green, blue = (float(value) for value in camera.get_picture("Color")[8, 8, :3])
     if not (red > 0.1 and green < red / 2 and blue < red / 2):
         raise RuntimeError(f"The picture is wrong: a red box came out as RGB ({red:.2f}, {green:.2f}, {blue:.2f})")
-    print(json.dumps(renderer._asdict()), flush=True)
+    stage("ask for the driver's version")
+    print(json.dumps({"renderer": renderer._asdict(), "driver": _driver_version(renderer.name)}), flush=True)
+
+
+def _driver_version(device: str) -> str:
+    import sapien
+
+    for loader in ("libvulkan.so.1", *map(str, Path(sapien.__file__).parent.glob("vulkan_library/libvulkan.so*"))):
+        with contextlib.suppress(OSError, AttributeError):
+            return vulkan.driver_versions(loader).get(device, "")
+    return ""
 
 
 # ---------------------------------------------------------------------- curing it
@@ -269,8 +292,8 @@ def setup_rendering(private: bool = False) -> int:
     if importlib.util.find_spec("sapien") is None:
         print("Rendering: FAILED. SAPIEN is not installed. Cure: pip install 'sb3_cpm[maniskill]'")
         return 1
-    if named := vulkan.named_drivers():
-        print(f"Rendering: FAILED. The environment names a Vulkan driver that does not work: {named}. Cure: unset it.")
+    if vulkan.named_drivers():
+        print(f"Rendering: FAILED. Cure: {cure()}.")
         return 1
     if not sys.platform.startswith("linux"):
         print("Rendering: FAILED. Software Vulkan can be installed automatically on Linux only; install a graphics driver.")
@@ -296,5 +319,5 @@ def _report(probe: Probe) -> int:
         print("Cure: run `python -m sb3_cpm doctor` and send its output with your bug report.")
         return 1
     kind = "in software" if probe.renderer.software else "with the graphics card"
-    print(f"Rendering: SAPIEN renders {kind}: {probe.renderer.name} ({probe.seconds:.1f} s).")
+    print(f"Rendering: SAPIEN renders {kind}: {probe.renderer.name}, driver {probe.driver} ({probe.seconds:.1f} s).")
     return 0

@@ -12,6 +12,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
@@ -62,6 +63,11 @@ def named_drivers() -> str:
 
 
 # ---------------------------------------------------------------------- using a private installation
+def private_in_use() -> bool:
+    """:return: whether there is a private installation and the user named no other driver"""
+    return (private_folder() / "icd.json").exists() and not named_drivers()
+
+
 def activate_private() -> bool:
     """
     Let this process use the private installation, if there is one and the user named no driver.
@@ -73,9 +79,9 @@ def activate_private() -> bool:
 
     :return: whether a private installation is in use
     """
-    icd = private_folder() / "icd.json"
-    if not icd.exists() or named_drivers():
+    if not private_in_use():
         return False
+    icd = private_folder() / "icd.json"
     waiting = sorted(_libraries(private_folder() / "root"))
     while waiting:
         failed = [path for path in waiting if not _loads(path)]
@@ -112,6 +118,42 @@ def _loads(path: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def driver_versions(loader: str) -> dict[str, str]:
+    """
+    Ask Vulkan itself, which SAPIEN does not pass on: the version tells a Mesa that is too old from one that is broken.
+
+    The structures are those of Vulkan's header ``vulkan_core.h``, written out as bytes ("q" and "Q" also align pointers).
+
+    :param loader: name or path of Vulkan's loader, ``libvulkan.so.1``
+    :return: device name to what the driver says of itself, e.g. ``"Mesa 25.0.7 (LLVM 15.0.6)"``
+    :raises OSError: if there is no such loader
+    :raises AttributeError: if it is older than Vulkan 1.1
+    """
+    library = ctypes.CDLL(loader)
+    # VkApplicationInfo (structure type 0): nothing but the version of Vulkan that is wanted, 1.2
+    application = ctypes.create_string_buffer(struct.pack("qQQqQiI", 0, 0, 0, 0, 0, 0, 1 << 22 | 2 << 12))
+    # VkInstanceCreateInfo (1): no layers, no extensions
+    create_info = struct.pack("qQqQqQqQ", 1, 0, 0, ctypes.addressof(application), 0, 0, 0, 0)
+    instance = ctypes.c_void_p()
+    if library.vkCreateInstance(create_info, None, ctypes.byref(instance)) != 0:
+        return {}
+    count, devices = ctypes.c_uint32(16), (ctypes.c_void_p * 16)()
+    library.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), devices)
+    found = {}
+    for device in devices[: count.value]:
+        # VkPhysicalDeviceDriverProperties (1000196000): id (4 bytes), driver's name (256), its information (256), ...
+        driver = ctypes.create_string_buffer(struct.pack("qQ", 1000196000, 0), 1024)
+        # VkPhysicalDeviceProperties2 (1000059001): five numbers of 4 bytes, device's name (256), limits ...
+        properties = ctypes.create_string_buffer(struct.pack("qQ", 1000059001, ctypes.addressof(driver)), 4096)
+        library.vkGetPhysicalDeviceProperties2(ctypes.c_void_p(device), properties)
+        name, information = (
+            raw.split(b"\0")[0].decode(errors="replace") for raw in (properties.raw[36:292], driver.raw[276:532])
+        )
+        found[name] = information
+    library.vkDestroyInstance(instance, None)
+    return found
 
 
 # ---------------------------------------------------------------------- installing

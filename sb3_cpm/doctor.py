@@ -1,0 +1,155 @@
+"""
+``python -m sb3_cpm doctor``: what works on this machine, what does not, and the cure.
+
+Nothing here changes anything, and every finding is one row: what was looked at, whether it is well, what was found, and what
+to do about it. Works without ManiSkill, a renderer and the optional packages, since those are what it looks for.
+"""
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+PYTHONS = ((3, 10), (3, 12))
+"""Oldest and newest Python that the package is tested with."""
+
+REQUIRED = ("stable-baselines3", "gymnasium", "numpy")
+OPTIONAL = ("sb3-contrib", "tensorboard", "matplotlib")
+SIMULATION = ("mani_skill", "sapien", "trimesh", "fast-simplification")
+
+MEMORY = 2.0
+"""GiB that should be free: a training run on PickCube's images takes about that."""
+
+DISK = 1.0
+"""GiB that should be free for the results of some runs."""
+
+
+class Finding(NamedTuple):
+    """
+    One row of the report.
+
+    :param what: what was looked at
+    :param well: whether it is as it should be
+    :param found: what was found
+    :param cure: what to do if it is not well
+    """
+
+    what: str
+    well: bool
+    found: str
+    cure: str = ""
+
+
+def run_doctor() -> int:
+    """
+    Print what works and what does not.
+
+    :return: exit status, 0 only if all is well
+    """
+    findings = []
+    for finding in examine():
+        findings.append(finding)
+        mark = "ok  " if finding.well else "FAIL"
+        print(f"{mark}  {finding.what:<22}{finding.found}", flush=True)
+        if not finding.well and finding.cure:
+            print(f"{'':<6}{'':<22}cure: {finding.cure}", flush=True)
+    bad = [finding.what for finding in findings if not finding.well]
+    print(f"\nNot well: {', '.join(bad)}. The cures are above." if bad else "\nAll is well.")
+    return 1 if bad else 0
+
+
+def examine() -> Iterator[Finding]:
+    """:return: the findings, one by one, since the last ones take some seconds"""
+    yield _python()
+    yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
+    yield _torch()
+    yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
+    yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
+    yield _memory()
+    yield _disk()
+    yield _video()
+    yield from _rendering()
+
+
+def _python() -> Finding:
+    oldest, newest = (".".join(map(str, version)) for version in PYTHONS)
+    well = PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]
+    system = f"{platform.system()} {platform.machine()}"
+    return Finding("Python", well, f"{platform.python_version()} on {system}", f"use Python {oldest} to {newest}")
+
+
+def _package(name: str, cure: str) -> Finding:
+    try:
+        return Finding(name, True, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, False, "not installed", cure)
+
+
+def _torch() -> Finding:
+    try:
+        import torch
+    except (ImportError, OSError) as error:  # OSError: a CUDA library that is not there
+        return Finding("torch", False, str(error).splitlines()[0], "install torch, see https://pytorch.org")
+    if torch.cuda.is_available():
+        device = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    else:
+        device = f"no GPU, {torch.get_num_threads()} CPU threads of {os.cpu_count()} cores"
+    return Finding("torch", True, f"{torch.__version__}, {device}")
+
+
+def _memory() -> Finding:
+    free, total = _memory_gib()
+    found = f"{free:.1f} of {total:.1f} GiB free"
+    return Finding("memory", free >= MEMORY, found, f"a training run needs about {MEMORY:g} GiB: close other programs")
+
+
+def _memory_gib() -> tuple[float, float]:
+    """Free and total, of the machine or, if that is less, of the container."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    total, free = os.sysconf("SC_PHYS_PAGES") * page, os.sysconf("SC_AVPHYS_PAGES") * page
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():  # "available" counts what the system would give back, "free" does not
+        fields = dict(line.split(":") for line in meminfo.read_text().splitlines() if ":" in line)
+        free = int(fields.get("MemAvailable", str(free // 1024)).split()[0]) * 1024
+    limit, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
+        allowed = int(limit.read_text())
+        total, free = min(total, allowed), min(free, allowed - int(used.read_text()))
+    return free / 2**30, total / 2**30
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(".").free / 2**30
+    return Finding("disk", free >= DISK, f"{free:.1f} GiB free in {os.getcwd()}", f"free at least {DISK:g} GiB for results")
+
+
+def _video() -> Finding:
+    path = shutil.which("ffmpeg")
+    if path is None:
+        try:
+            import imageio_ffmpeg
+
+            path = imageio_ffmpeg.get_ffmpeg_exe()
+        except (ImportError, RuntimeError):
+            return Finding("ffmpeg (videos)", False, "not found", "pip install imageio-ffmpeg, or install ffmpeg")
+    return Finding("ffmpeg (videos)", True, str(path))
+
+
+def _rendering() -> Iterator[Finding]:
+    from sb3_cpm.envs import rendering, vulkan
+
+    if not all(_package(name, "").well for name in ("mani_skill", "sapien")):
+        yield Finding("SAPIEN renders", False, "not tried without ManiSkill", "pip install 'sb3_cpm[maniskill]'")
+        return
+    probe = rendering.probe_renderer()
+    if probe.renderer is None:
+        yield Finding("SAPIEN renders", False, probe.problem, rendering.cure())
+        return
+    private = "" if not vulkan.private_in_use() else f", private in {vulkan.private_folder()}"
+    yield Finding("Vulkan driver", True, f"{probe.renderer.name}, {probe.driver or 'version unknown'}{private}")
+    how = "in software" if probe.renderer.software else "with a GPU"
+    yield Finding("SAPIEN renders", True, f"{how}, tried in a child process ({probe.seconds:.1f} s)")
