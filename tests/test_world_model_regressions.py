@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from challenger_helpers import BOTH, IMAGES, SMALL, VECTOR, box, random_batch, small, weights
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_cpm.challenger import Challenger
@@ -19,7 +20,6 @@ from sb3_cpm.world_model.losses import balanced_kl, lambda_returns
 from sb3_cpm.world_model.optimizer import Optimizer
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 from sb3_cpm.world_model.world_model import Sequences, WorldModelOutput
-from challenger_helpers import BOTH, IMAGES, SMALL, VECTOR, box, random_batch, small, weights
 
 CATEGORICAL = {**SMALL, "latent": "categorical", "stoch_size": 4, "stoch_classes": 5}
 

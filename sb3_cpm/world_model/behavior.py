@@ -14,7 +14,7 @@ from torch import nn
 
 from sb3_cpm.world_model.distributions import TruncatedNormal
 from sb3_cpm.world_model.losses import lambda_returns
-from sb3_cpm.world_model.networks import MLP, initialize
+from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.optimizer import Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import WorldModel
@@ -54,7 +54,6 @@ class Actor(nn.Module):
     def __init__(self, feat_dim: int, action_dim: int, layers: int, units: int) -> None:
         super().__init__()
         self.net = MLP(feat_dim, layers, units, 2 * action_dim)
-        self.apply(initialize)
 
     def forward(self, feat: torch.Tensor) -> TruncatedNormal:
         mean, raw = self.net(feat).chunk(2, dim=-1)
@@ -83,7 +82,7 @@ class ActorCritic(nn.Module):
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
 
     def _make_critic(self, feat_dim: int) -> MLP:
-        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1).apply(initialize)
+        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1)
 
     def make_optimizers(self) -> dict[str, Optimizer]:
         """Optimizers of actor and critic, by name."""

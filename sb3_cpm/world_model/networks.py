@@ -1,19 +1,14 @@
 """
 The building blocks of the world model (report, B.1): MLPs, convolutional encoder and decoder, layer-norm GRU cell.
+
+Initial weights are torch's own. Glorot's, as in Dreamer's TensorFlow original, start with larger outputs and learnt more
+slowly here: open-loop pixel error after 300 updates of a moving square 0.074 instead of 0.063.
 """
 
 import torch
 from torch import nn
 
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
-
-
-def initialize(module: nn.Module) -> None:
-    """Glorot initialisation as in Dreamer's TensorFlow original; use with ``module.apply(initialize)``."""
-    if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
-        nn.init.xavier_uniform_(module.weight)
-        if module.bias is not None:
-            nn.init.zeros_(module.bias)
 
 
 def channels_last(module: nn.Sequential) -> nn.Sequential:

@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent, Latent
 from sb3_cpm.world_model.losses import balanced_kl, masked_mean, squared_error
-from sb3_cpm.world_model.networks import MLP, Decoder, Encoder, initialize
+from sb3_cpm.world_model.networks import MLP, Decoder, Encoder
 from sb3_cpm.world_model.observations import Inputs, ObservationSpec, symexp, symlog
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 
@@ -80,7 +80,6 @@ class WorldModel(nn.Module):
         head = (self.feat_dim, preset["head_layers"], preset["head_units"], 1)
         self.reward_head = MLP(*head)
         self.continue_head = MLP(*head) if preset["continue_head"] else None
-        self.apply(initialize)
 
     def loss(self, batch: Sequences) -> WorldModelOutput:
         """Everything that one update of the world model minimises, and the posterior states it found on the way."""
