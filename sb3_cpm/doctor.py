@@ -107,7 +107,7 @@ def _memory() -> Finding:
     return Finding("memory", free >= MEMORY, found, f"a training run needs about {MEMORY:g} GiB: close other programs")
 
 
-def _memory_gib() -> tuple[float, float]:
+def _memory_gib(group: Path = Path("/sys/fs/cgroup")) -> tuple[float, float]:
     """Free and total, of the machine or, if that is less, of the container."""
     page = os.sysconf("SC_PAGE_SIZE")
     total, free = os.sysconf("SC_PHYS_PAGES") * page, os.sysconf("SC_AVPHYS_PAGES") * page
@@ -115,7 +115,7 @@ def _memory_gib() -> tuple[float, float]:
     if meminfo.exists():  # "available" counts what the system would give back, "free" does not
         fields = dict(line.split(":") for line in meminfo.read_text().splitlines() if ":" in line)
         free = int(fields.get("MemAvailable", str(free // 1024)).split()[0]) * 1024
-    limit, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    limit, used = (group / name for name in ("memory.max", "memory.current"))
     if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
         allowed = int(limit.read_text())
         total, free = min(total, allowed), min(free, allowed - int(used.read_text()))

@@ -87,8 +87,7 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
             self._scene_changed()
         # A new episode starts before any contact; ManiSkill still reports the contact of the previous episode's last step.
         for source in (raw["extra"], info):
-            if "is_grasped" in source:
-                source["is_grasped"] = np.zeros(1, dtype=bool)
+            source.update({key: np.zeros(1, dtype=bool) for key in source if "grasp" in key})
         return self._observe(raw), self._plain_info(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -180,8 +179,8 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _plain_info(self, info: dict[str, Any]) -> dict[str, Any]:
         plain: dict[str, Any] = {}
         for key, value in info.items():
-            array = _numpy(value)
-            plain[key] = array.reshape(-1)[0].item() if array.size == 1 else array
+            array = np.squeeze(_numpy(value))  # without the batch of one
+            plain[key] = array.item() if array.ndim == 0 else array
         if "success" in plain:
             plain["success"] = plain["is_success"] = bool(plain["success"])
         return plain

@@ -107,9 +107,9 @@ def explained(env_id: str) -> Iterator[None]:
     except (FileNotFoundError, EOFError, SystemExit) as error:
         raise _missing_assets(env_id, str(error)) from error
     except RuntimeError as error:
-        if "ownload" not in str(error):
+        if "download" not in str(error).lower():
             raise
-        raise _missing_assets(env_id, str(error)) from error
+        raise RuntimeError(f"{env_id} needs files that are not here. ManiSkill says: {error}") from error
     finally:
         logger.setLevel(level)
 
@@ -121,7 +121,8 @@ def _check_assets(env_id: str, asset_ids: Any) -> None:
     missing = []
     for asset_id in asset_ids:
         group = asset_id in assets.DATA_GROUPS
-        for source_id in assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else (asset_id,):
+        source_ids = assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else (asset_id,)
+        for source_id in sorted(source_ids):
             source = assets.DATA_SOURCES[source_id]
             folder = Path(source.output_dir) / source.target_path
             empty = folder.is_dir() and not any(folder.iterdir())

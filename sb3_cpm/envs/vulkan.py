@@ -59,7 +59,7 @@ def private_folder() -> Path:
 def named_drivers() -> str:
     """:return: the variables with which the user (not we) named Vulkan drivers, as ``NAME=value``, empty if there are none"""
     ours = str(private_folder() / "icd.json")
-    return " ".join(f"{name}={os.environ[name]}" for name in DRIVER_VARIABLES if os.environ.get(name, ours) != ours)
+    return " ".join(f"{name}={os.environ[name]}" for name in DRIVER_VARIABLES if (os.environ.get(name) or ours) != ours)
 
 
 # ---------------------------------------------------------------------- using a private installation

@@ -1,0 +1,92 @@
+"""The doctor on this machine, and on machines that lack something."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sb3_cpm import doctor
+from sb3_cpm.envs import rendering
+
+WORKS = rendering.Probe(rendering.Renderer("cpu", "llvmpipe", True), "Mesa 25.0.7", "", 1.0)
+
+
+@pytest.mark.maniskill
+def test_all_is_well_here(capsys: pytest.CaptureFixture[str]) -> None:
+    status = doctor.run_doctor()
+    output = capsys.readouterr().out
+    assert status == 0, output
+    assert "All is well." in output and "FAIL" not in output
+    for what in ("Python", "torch", "sapien", "Vulkan driver", "SAPIEN renders", "memory", "disk", "ffmpeg"):
+        assert what in output
+
+
+@pytest.mark.maniskill
+def test_no_vulkan_is_not_well(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
+    assert doctor.run_doctor() == 1
+    output = capsys.readouterr().out
+    assert "FAIL  SAPIEN renders" in output and "cure: The environment names" in output
+    assert "Not well: SAPIEN renders." in output
+
+
+def test_each_lack_has_a_cure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(rendering, "probe_renderer", lambda: WORKS._replace(renderer=None, problem="It died of SIGSEGV."))
+    monkeypatch.setattr(doctor, "_memory_gib", lambda: (0.5, 8.0))
+    monkeypatch.setattr(doctor, "PYTHONS", ((3, 7), (3, 8)))
+    monkeypatch.setattr(doctor, "OPTIONAL", ("a-package-that-nobody-has",))
+    monkeypatch.setattr(doctor, "DISK", 1e9)
+    assert doctor.run_doctor() == 1
+    lines = capsys.readouterr().out.splitlines()
+    bad = [i for i, line in enumerate(lines) if line.startswith("FAIL")]
+    assert len(bad) >= 5
+    assert all(lines[i + 1].strip().startswith("cure: ") for i in bad)
+    assert any("a-package-that-nobody-has" in line and "not installed" in line for line in lines)
+
+
+def test_without_maniskill_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    package = doctor._package
+
+    def without(name: str, cure: str) -> doctor.Finding:
+        return doctor.Finding(name, False, "not installed", cure) if name in doctor.SIMULATION else package(name, cure)
+
+    def never(*_: Any) -> None:
+        raise AssertionError("there is nothing to try")
+
+    monkeypatch.setattr(doctor, "_package", without)
+    monkeypatch.setattr(rendering, "probe_renderer", never)
+    findings = {finding.what: finding for finding in doctor.examine()}
+    assert not findings["SAPIEN renders"].well and "sb3_cpm[maniskill]" in findings["SAPIEN renders"].cure
+
+
+def test_the_package_imports_without_maniskill() -> None:
+    """With ManiSkill and SAPIEN forbidden everything works but making an environment, which says what it needs."""
+    code = """
+import sys
+sys.modules["mani_skill"] = sys.modules["sapien"] = None  # as if not installed
+import sb3_cpm, sb3_cpm.envs, sb3_cpm.doctor
+from sb3_cpm.envs import rendering
+import importlib.util
+found = importlib.util.find_spec
+importlib.util.find_spec = lambda name: None if name in ("mani_skill", "sapien") else found(name)
+try:
+    sb3_cpm.envs.make_maniskill_env("PickCube-v1")
+except ImportError as error:
+    assert "pip install 'sb3_cpm[maniskill]'" in str(error), error
+    print("said so")
+"""
+    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    assert child.stdout.strip() == "said so", child.stderr
+
+
+def test_a_container_limit_counts(tmp_path: Path) -> None:
+    free, total = doctor._memory_gib()
+    assert 0 < free <= total
+    (tmp_path / "memory.max").write_text(f"{2**28}\n")
+    (tmp_path / "memory.current").write_text(f"{2**27}\n")
+    assert doctor._memory_gib(tmp_path) == (0.125, 0.25)
+    (tmp_path / "memory.max").write_text("max\n")
+    assert doctor._memory_gib(tmp_path)[1] == total

@@ -1,0 +1,212 @@
+"""Finding and curing the renderer: the real one in child processes, apt's and SAPIEN's texts by example."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_cpm.envs import rendering, vulkan
+
+NOWHERE = {"VK_DRIVER_FILES": "/nonexistent.json", "VK_ICD_FILENAMES": "/nonexistent.json"}
+"""A machine without Vulkan, as far as Vulkan's loader can tell."""
+
+DEB822 = """Types: deb
+# http://snapshot.example/20250520
+URIs: http://mirror.example/debian
+Suites: bookworm bookworm-updates
+Components: main
+Signed-By: /usr/share/keyrings/debian-archive-keyring.gpg
+
+Types: deb
+URIs: http://mirror.example/debian-security
+Suites: bookworm-security
+Components: main
+"""
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+
+
+# ---------------------------------------------------------------------- package sources
+def test_backports_copy_mirror_and_key_of_the_release() -> None:
+    made = vulkan.backports_source({"debian.sources": DEB822}, "bookworm")
+    assert made == (
+        "sb3-cpm-backports.sources",
+        "Types: deb\nURIs: http://mirror.example/debian\nSuites: bookworm-backports\nComponents: main\n"
+        "Signed-By: /usr/share/keyrings/debian-archive-keyring.gpg\n",
+    )
+
+
+def test_backports_from_the_old_format() -> None:
+    text = (
+        "# deb http://old.example bookworm main\ndeb [signed-by=/key.gpg] http://mirror.example/debian bookworm main contrib\n"
+    )
+    made = vulkan.backports_source({"sources.list": text}, "bookworm")
+    expected = "deb [signed-by=/key.gpg] http://mirror.example/debian bookworm-backports main contrib\n"
+    assert made == ("sb3-cpm-backports.list", expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "codename"),
+    [
+        (DEB822, None),  # not Debian
+        (DEB822, "trixie"),  # nothing to copy
+        (DEB822 + "\nTypes: deb\nURIs: http://m/debian\nSuites: bookworm-backports\nComponents: main\n", "bookworm"),
+        (DEB822.replace("Types: deb\n#", "Types: deb\nEnabled: no\n#"), "bookworm"),
+    ],
+)
+def test_no_backports_where_they_make_no_sense(text: str, codename: str | None) -> None:
+    assert vulkan.backports_source({"debian.sources": text}, codename) is None
+
+
+def test_newest_suite_wants_a_mesa_that_sapien_can_use() -> None:
+    old = "mesa-vulkan-drivers | 22.3.6-1+deb12u1 | http://mirror.example/debian bookworm/main amd64 Packages\n"
+    new = "mesa-vulkan-drivers | 25.0.7-2~bpo12+1 | http://mirror.example/debian bookworm-backports/main amd64 Packages\n"
+    source = "mesa | 26.0.0-1 | http://mirror.example/debian sid/main Sources\n"
+    assert vulkan.newest_suite(old + new + source) == "bookworm-backports"
+    assert vulkan.newest_suite(old + source) is None
+    assert vulkan.newest_suite("") is None
+    assert vulkan.newest_suite(old.replace("22.3.6", "1:24.3.0")) == "bookworm"
+
+
+# ---------------------------------------------------------------------- what SAPIEN says
+def test_device_names() -> None:
+    summary = (
+        "GPU: NVIDIA H200\n  Supported: 1\n  Present:   0\n  cudaId:    0\n  rayTrace:  1\n\n"
+        "GPU: Old Card\n  Supported: 0\n  cudaId:    -1\n\n"
+        "GPU: llvmpipe (LLVM 15.0.6, 256 bits)\n  Supported: 1\n  Present:   0\n  cudaId:    -1\n"
+    )
+    assert rendering.device_names(summary) == [("NVIDIA H200", True), ("llvmpipe (LLVM 15.0.6, 256 bits)", False)]
+    assert rendering.device_names("") == []
+
+
+def test_cache_folder_falls_back_to_the_temporary_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("SB3_CPM_CACHE", str(tmp_path / "mine"))
+    assert vulkan.cache_folder() == tmp_path / "mine" and (tmp_path / "mine").is_dir()
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.delenv("SB3_CPM_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert vulkan.cache_folder() == tmp_path / f"sb3_cpm-{os.getuid()}"
+
+
+def test_publish_keeps_what_is_there(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text(name)
+        rendering.publish(tmp_path / name, tmp_path / "target")
+    assert (tmp_path / "target" / "file").read_text() == "first"
+
+
+def test_a_failed_import_of_opencv_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", ["/site-packages/cv2", "/site-packages"])
+    monkeypatch.delitem(sys.modules, "cv2", raising=False)
+    vars(sys)["OpenCV_LOADER"] = True
+    vulkan.forget_failed_opencv()
+    assert sys.path == ["/site-packages"] and not hasattr(sys, "OpenCV_LOADER")
+
+
+# ---------------------------------------------------------------------- the real renderer
+@pytest.mark.maniskill
+def test_probe_and_set_up_where_rendering_works(capsys: pytest.CaptureFixture[str]) -> None:
+    probe = rendering.probe_renderer()
+    assert probe.problem == "" and probe.renderer is not None
+    assert probe.driver  # e.g. "Mesa 25.0.7 (LLVM 15.0.6)"
+    assert rendering.setup_rendering() == 0  # nothing to do, nothing done
+    assert "SAPIEN renders" in capsys.readouterr().out
+
+
+@pytest.mark.maniskill
+def test_a_machine_without_vulkan_gets_the_cure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, value in NOWHERE.items():
+        monkeypatch.setenv(name, value)
+    probe = rendering.probe_renderer()
+    assert probe.renderer is None and "No usable Vulkan driver" in probe.problem
+    assert rendering.setup_rendering() == 1  # installing would not help, so nothing is installed
+    assert "unset VK_DRIVER_FILES=/nonexistent.json" in capsys.readouterr().out
+    code = "from sb3_cpm.envs import make_maniskill_env; make_maniskill_env('PickCube-v1')"
+    child = python(code)
+    assert child.returncode == 1 and "RuntimeError: No usable Vulkan driver" in child.stderr and "unset VK_" in child.stderr
+
+
+@pytest.mark.maniskill
+def test_a_crash_is_told_from_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/sh")  # a child that does not even know Python
+    assert rendering.probe_renderer().renderer is None
+    crash = "import os, signal; print('>draw a picture', flush=True); os.kill(os.getpid(), signal.SIGSEGV)"
+    monkeypatch.undo()
+    run = subprocess.run
+    monkeypatch.setattr(subprocess, "run", lambda command, **k: run([command[0], "-c", crash], **k))
+    assert "died of SIGSEGV while it tried to draw a picture" in rendering.probe_renderer().problem
+    hang = "import time; print('>draw a picture', flush=True); time.sleep(60)"
+    monkeypatch.setattr(subprocess, "run", lambda command, **k: run([command[0], "-c", hang], **k))
+    assert "hung for 1 s while it tried to draw a picture" in rendering.probe_renderer(timeout=1).problem
+
+
+@pytest.mark.maniskill
+def test_a_private_driver_is_used(tmp_path: Path) -> None:
+    """The private installation, played by the machine's own driver: without the folder nothing would be found."""
+    drivers = [p for folder in ("/usr/share", "/etc") for p in Path(folder, "vulkan/icd.d").glob("lvp_icd*.json")]
+    private = vulkan.private_folder() / "icd.json"
+    if drivers:
+        description = json.loads(drivers[0].read_text())
+        library = description["ICD"]["library_path"]
+        found = [p for p in Path("/usr").glob(f"lib*/*/{Path(library).name}")] + [Path(library)]
+        description["ICD"]["library_path"] = str(found[0])
+    elif private.exists():
+        description = json.loads(private.read_text())
+    else:
+        pytest.skip("this machine renders with a graphics card and has no software driver to play with")
+    (tmp_path / "vulkan").mkdir()
+    (tmp_path / "vulkan/icd.json").write_text(json.dumps(description))
+    code = """
+import os
+from sb3_cpm.envs import rendering
+renderer = rendering.ensure_renderer()
+assert renderer.software and os.environ["VK_DRIVER_FILES"] == os.environ["VK_ICD_FILENAMES"]
+print(os.environ["VK_DRIVER_FILES"])
+"""
+    environment = {name: "" for name in vulkan.DRIVER_VARIABLES}
+    child = python(code, SB3_CPM_CACHE=str(tmp_path), **environment)
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.strip() == str(tmp_path / "vulkan/icd.json")
+
+
+PICTURES = """
+import sys
+import numpy as np
+from sb3_cpm.envs import make_maniskill_env, rendering
+if sys.argv[1] == "stock":
+    rendering.use_fast_shaders = lambda: False
+env = make_maniskill_env("PickCube-v1", image_size=16, render_size=48, visuals="light")
+frames = [env.reset(seed=0)[0]]
+frames += [env.step(np.full(7, 0.5, dtype=np.float32))[0] for _ in range(3)]
+np.savez(sys.argv[2], frame=env.render(), **{f"{k}{i}": v for i, f in enumerate(frames) for k, v in f.items()})
+"""
+
+
+@pytest.mark.maniskill
+@pytest.mark.slow
+def test_fast_shaders_draw_the_same_to_the_last_bit(tmp_path: Path) -> None:
+    if not rendering.ensure_renderer().software:
+        pytest.skip("only used with a software renderer")
+    for kind in ("stock", "fast"):
+        code = PICTURES.replace("sys.argv[1]", repr(kind)).replace("sys.argv[2]", repr(str(tmp_path / f"{kind}.npz")))
+        child = python(code)
+        assert child.returncode == 0, child.stderr
+    stock, fast = (dict(np.load(tmp_path / f"{kind}.npz")) for kind in ("stock", "fast"))
+    assert stock.keys() == fast.keys() and len(stock) == 4 * 4 + 1
+    for key, value in stock.items():
+        np.testing.assert_array_equal(value, fast[key], err_msg=key)
