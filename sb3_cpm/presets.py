@@ -77,7 +77,6 @@ DEFAULT: dict[str, Any] = {
     "model_lr": 1e-3,
     "actor_lr": 3e-4,
     "critic_lr": 3e-4,
-    "uncertainty_lr": 1e-3,
     "imagination_starts": 64,
     "actor_layers": 2,
     "actor_units": 128,
