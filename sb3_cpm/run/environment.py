@@ -1,5 +1,6 @@
 """Environments of a run, by name."""
 
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -52,6 +53,7 @@ def make_vec_env(env_id: str, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
         def make() -> gym.Env:
             if n_envs > 1:  # in a process of its own
                 set_random_seed(seed + rank)
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main one ends this one
             env = Monitor(make_env(env_id, **kwargs))
             env.action_space.seed(seed + rank)
             return env

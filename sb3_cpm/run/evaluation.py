@@ -1,5 +1,6 @@
 """The deterministic player on episodes of its own: always the same seeds, which training never uses."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,6 +70,7 @@ class Evaluator(BaseCallback):
     :param total_steps: length of the run
     :param n_evaluations: how many, start and end included; 0 for none
     :param n_episodes: episodes of each
+    :param after_each: called after each with a line about it
     """
 
     def __init__(
@@ -79,11 +81,13 @@ class Evaluator(BaseCallback):
         total_steps: int,
         n_evaluations: int,
         n_episodes: int,
+        after_each: Callable[[str], None] = lambda news: None,
     ) -> None:
         super().__init__()
         self.env = env
         self.challenger = challenger
         self.n_episodes = n_episodes
+        self.after_each = after_each
         self.results: list[tuple[int, list[EpisodeResult]]] = []
         #: Steps at which an evaluation is due, the last one excepted, which ``at_end`` makes.
         self._due = [round(total_steps * index / (n_evaluations - 1)) for index in range(n_evaluations - 1)]
@@ -134,6 +138,8 @@ class Evaluator(BaseCallback):
         self.logger.record("eval/mean_reward", mean_return)
         if success is not None:
             self.logger.record("eval/success_rate", success)
+        told = "" if success is None else f", success {success:.0%}"
+        self.after_each(f"step {self.num_timesteps}: evaluated return {mean_return:.2f}{told}")
 
 
 def success_rate(results: list[EpisodeResult]) -> float | None:

@@ -66,7 +66,13 @@ def challenge_gallery(path: Path, shots: Sequence[Shot], title: str) -> None:
         figure.text(0.03, 1 - 0.52 / height, EXPLANATION, fontsize=9.5, color="#4a5568", va="top", linespacing=1.4)
         figure.legend(handles=_legend(), loc="upper left", bbox_to_anchor=(0.022, 1 - 0.93 / height), ncols=7, fontsize=9.5)
         rows = figure.add_gridspec(
-            len(shots), 1, hspace=0.32, left=0.055, right=0.99, top=1 - 1.55 / height, bottom=0.5 / height
+            len(shots),
+            1,
+            hspace=0.75 / (row_height - 0.75),
+            left=0.055,
+            right=0.99,
+            top=1 - 1.55 / height,
+            bottom=0.5 / height,
         )
         for row, shot in enumerate(shots):
             _draw_shot(figure, rows[row], shot, strip_height)

@@ -54,10 +54,11 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     known = np.isfinite(values)
     sums = np.cumsum(np.where(known, values, 0.0))
     counts = np.cumsum(known)
-    before = np.arange(len(values)) - window
-    earlier_sums = np.where(before >= 0, sums[before], 0.0)
-    earlier_counts = np.where(before >= 0, counts[before], 0)
-    return (sums - earlier_sums) / np.maximum(counts - earlier_counts, 1)
+    earlier = np.arange(len(values)) - window  # last index that is too old
+    dropped = np.maximum(earlier, 0)
+    sums = sums - np.where(earlier >= 0, sums[dropped], 0.0)
+    counts = counts - np.where(earlier >= 0, counts[dropped], 0)
+    return sums / np.maximum(counts, 1)
 
 
 def learning_curve(folder: Path, title: str) -> None:
@@ -101,7 +102,7 @@ def _draw_returns(axes: Axes, episodes: dict[str, np.ndarray], evaluations: dict
             ms=6,
             capsize=3,
             lw=1.2,
-            label="evaluation: deterministic P, mean, worst and best",
+            label="evaluation of P: mean, worst, best",
         )
     _legend_above(axes)
     axes.set_ylabel("sum of task rewards of an episode")

@@ -48,6 +48,7 @@ class TrainSettings:
     :param eval_episodes: episodes of each evaluation, always with the same seeds, which training never uses
     :param video: film an episode at the end
     :param device: PyTorch device
+    :param threads: of torch on the CPU; more than one rarely pays at these sizes
     :param progress_bar: None: where the terminal can show one
     :param env_kwargs: arguments of the environment
     :param model_kwargs: further arguments of the SB3 algorithm
@@ -79,6 +80,7 @@ class TrainSettings:
     eval_episodes: int = 5
     video: bool = True
     device: str = "auto"
+    threads: int = 1
     progress_bar: bool | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     model_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -88,7 +90,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         if self.algorithm not in ALGORITHMS:
             raise ValueError(f"algorithm={self.algorithm!r}: expected one of {ALGORITHMS}")
-        for name in ("n_envs", "batch_size", "train_freq", "challenger_train_freq"):
+        for name in ("n_envs", "batch_size", "train_freq", "challenger_train_freq", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected 1 or more")
         if self.steps is not None and self.steps < 1:

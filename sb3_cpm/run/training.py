@@ -6,6 +6,7 @@ closed. SB3 does the training; this module only prepares, watches and tidies up.
 """
 
 import contextlib
+import shutil
 import signal
 import sys
 import time
@@ -14,8 +15,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import torch as th
 from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
@@ -68,16 +70,17 @@ class Run:
         self.settings = settings
         self.started = time.perf_counter()
         self.title = f"CPM-{settings.algorithm.upper()} on {settings.env}, seed {settings.seed}"
+        th.set_num_threads(settings.threads)
         with contextlib.ExitStack() as undo:
+            self.folder = run_folder.make_run_folder(settings)
+            undo.callback(shutil.rmtree, self.folder, ignore_errors=True)
             self.env = make_vec_env(settings.env, settings.n_envs, settings.seed, **settings.env_kwargs)
             undo.callback(self.env.close)
             self.model = make_model(settings, self.env)
             self.evaluation_env = make_env(settings.env, render_mode="rgb_array", **settings.env_kwargs)
             undo.callback(self.evaluation_env.close)
             self.challenger = make_challenger(settings)
-            self.folder = run_folder.make_run_folder(settings)
             undo.pop_all()
-        self._close_actions: list[Callable[[], Any]] = []
         self._describe()
 
     def _describe(self) -> None:
@@ -91,8 +94,16 @@ class Run:
         total = self.settings.steps or 0
         self.recorder = Recorder(self.folder, self.challenger, total)
         self.evaluator = Evaluator(
-            self.evaluation_env, self.folder, self.challenger, total, self.settings.evaluations, self.settings.eval_episodes
+            self.evaluation_env,
+            self.folder,
+            self.challenger,
+            total,
+            self.settings.evaluations,
+            self.settings.eval_episodes,
+            after_each=self._checkpoint,
         )
+        wanted = self.settings.progress_bar
+        self.progress_bar = ProgressBarCallback() if (sys.stderr.isatty() if wanted is None else wanted) else None
 
     def execute(self, callback: BaseCallback | None = None) -> Summary:
         """
@@ -101,52 +112,73 @@ class Run:
         :param callback: a further callback
         :return: the numbers of the run
         """
-        outcome = "finished"
-        callbacks = [self.challenger, self.recorder, self.evaluator, *([callback] if callback else [])]
+        # the order matters: what a callback reads of another must have happened
+        callbacks = [self.challenger, self.recorder, self.evaluator, self.progress_bar, callback]
         say(f"{self.title}: {self.settings.steps} steps, results go to {self.folder}")
         try:
-            self.model.learn(
-                self.settings.steps or 0,
-                callback=callbacks,
-                log_interval=2,
-                progress_bar=self._progress_bar(),
-            )
+            self.model.learn(self.settings.steps or 0, [one for one in callbacks if one is not None], log_interval=2)
             self.evaluator.at_end()
         except BaseException as error:
-            outcome = _describe_end(error)
-            raise
-        finally:
             with _no_second_interrupt():
-                summary = self._finish(outcome)
+                if self.model.num_timesteps == 0:
+                    self._discard()
+                else:
+                    self._finish(_describe_end(error))
+            raise
+        with _no_second_interrupt():
+            summary = self._finish("finished")
         summary.show()
         return summary
 
-    def _progress_bar(self) -> bool:
-        wanted = self.settings.progress_bar
-        return sys.stderr.isatty() if wanted is None else wanted
+    def _checkpoint(self, news: str) -> None:
+        """After each evaluation: should the process die without a word, this much is there."""
+        if self.progress_bar is None:
+            say(news)
+        with self.challenger.stopwatch.section("pictures and saving"):
+            self._save("model.zip", self.model.save)
+            self._save_challenger()
 
     # ------------------------------------------------------------------ what is left behind
 
+    def _discard(self) -> None:
+        """The run ended before its first step, so there is nothing to keep: no empty folder stays behind."""
+        self._close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _close(self) -> None:
+        for what, close in (
+            ("the progress bar", self._close_progress_bar),
+            ("the logs", self.model.logger.close),
+            ("the tables", self.recorder.close),
+            ("the environments", self.env.close),
+            ("the evaluation environment", self.evaluator.close),
+        ):
+            _attempt(what, close)
+
+    def _close_progress_bar(self) -> None:
+        if self.progress_bar is not None and hasattr(self.progress_bar, "pbar"):
+            self.progress_bar.pbar.close()
+
     def _finish(self, outcome: str) -> Summary:
         """Write everything and close the environments. What fails is told and doesn't keep the rest from being written."""
+        self._close_progress_bar()
         folder, finished = self.folder, outcome == "finished"
-        end = "Finished" if finished else f"{outcome} at step {self.model.num_timesteps}".capitalize()
-        say(f"{end}: writing everything to {folder}")
+        say(f"Run {outcome}, step {self.model.num_timesteps}: writing everything to {folder}")
         jobs: list[tuple[str, Callable[[], Any]]] = [
             ("the model", lambda: self._save("model.zip", self.model.save)),
             ("the challenger", self._save_challenger),
             ("the replay buffer", lambda: self._save("replay_buffer.pkl", self.model.save_replay_buffer)),
-            ("the logs", self._close_logs),
+            ("the logs", lambda: self.model.logger.dump(self.model.num_timesteps)),
             ("the learning curve", lambda: plots.learning_curve(folder, self.title)),
             ("the coefficients", lambda: plots.coefficients(folder, self.title)),
             ("the challenge gallery", self._draw_gallery),
         ]
         if self.settings.video and finished:
             jobs.append(("the video", self._film))
-        jobs += [("the environments", self.env.close), ("the evaluation environment", self.evaluator.close)]
         with self.challenger.stopwatch.section("pictures and saving"):
             for what, job in jobs:
                 _attempt(what, job)
+            self._close()
         summary = self._summary(outcome)
         summary.write(folder)
         return summary
@@ -158,11 +190,6 @@ class Run:
     def _save_challenger(self) -> None:
         if self.challenger.challenger is not None:
             self._save("challenger.pt", self.challenger.save)
-
-    def _close_logs(self) -> None:
-        self.model.logger.dump(self.model.num_timesteps)
-        self.model.logger.close()
-        self.recorder.close()
 
     def _draw_gallery(self) -> None:
         shots = self.recorder.shots.choose(N_SHOTS)

@@ -1,0 +1,79 @@
+"""The command line."""
+
+from pathlib import Path
+
+import pytest
+
+from sb3_cpm import __main__ as cli
+from sb3_cpm import __version__
+from sb3_cpm.run.settings import TrainSettings, field_documentation
+
+
+def settings_of(*arguments: str) -> TrainSettings:
+    options = vars(cli.make_parser().parse_args(["train", *arguments]))
+    options.pop("command")
+    return TrainSettings(**options)
+
+
+def test_defaults_are_those_of_the_settings() -> None:
+    assert settings_of() == TrainSettings()
+
+
+def test_every_kind_of_option() -> None:
+    settings = settings_of(
+        *("--env", "CPMToy-v0", "--steps", "12", "--tau", "0.5", "--unit", "episode", "--no-video", "--progress-bar"),
+        *("--env-kwargs", "keys=[state, camera]", "n_points=3", "--env-kwargs", "task=push"),
+    )
+    assert (settings.env, settings.steps, settings.tau, settings.unit) == ("CPMToy-v0", 12, 0.5, "episode")
+    assert (settings.video, settings.progress_bar) == (False, True)
+    assert settings.env_kwargs == {"keys": ["state", "camera"], "n_points": 3, "task": "push"}
+    assert settings_of().env_kwargs == {}, "options of one call don't leak into the next"
+
+
+def test_help_explains_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    assert set(field_documentation()) == set(TrainSettings().as_dict())
+    for arguments in (["--help"], ["train", "--help"], ["setup-rendering", "--help"], ["--version"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(arguments)
+        assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert "--challenge-ratio" in text and "doctor" in text and "CPMToy-v0" in text
+    assert ":func:" not in text and "``" not in text
+    assert __version__ in text
+
+
+@pytest.mark.parametrize("arguments", [["fly"], [], ["train", "--env-kwargs", "x"], ["train", "--env-kwargs", "x=[1"]])
+def test_wrong_command_lines(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(arguments)
+    assert stop.value.code == 2
+    assert "error" in capsys.readouterr().err
+
+
+def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "notes.txt").touch()
+    assert cli.main(["train", "--env", "CPMToy-v0", "--run-folder", str(full)]) == 1
+    assert capsys.readouterr().err.startswith("error: The run folder")
+    assert [path.name for path in full.iterdir()] == ["notes.txt"]
+
+
+def test_train_and_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = []
+
+    def interrupted(settings: TrainSettings) -> None:
+        trained.append(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sb3_cpm.run.training.train", interrupted)
+    assert cli.main(["train", "--seed", "7"]) == 130
+    assert trained[0].seed == 7
+
+
+def test_doctor_and_rendering_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_cpm.doctor.run_doctor", lambda: 3)
+    monkeypatch.setattr("sb3_cpm.envs.rendering.setup_rendering", lambda private: 4 + private)
+    assert cli.main(["doctor"]) == 3
+    assert cli.main(["setup-rendering"]) == 4
+    assert cli.main(["setup-rendering", "--private"]) == 5
