@@ -101,19 +101,20 @@ class ActorCritic(nn.Module):
         :param world_model: supplies the dynamics; its weights get no gradient
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """
-        states, feats, actions, entropies = [start], [start.feat], [], []
+        states, feats, actions, policies = [start], [start.feat], [], []
         for _ in range(self.preset["horizon"]):
-            policy = self.actor(feats[-1])
-            actions.append(policy.rsample())
-            entropies.append(policy.entropy())
+            policies.append(self.actor(feats[-1]))
+            actions.append(policies[-1].rsample())
             states.append(world_model.rssm.imagine_step(states[-1], actions[-1]))
             feats.append(states[-1].feat)
+        # many small operations less than the entropies of single steps
+        policy = TruncatedNormal(*(torch.stack(part) for part in zip(*((p.loc, p.scale) for p in policies), strict=True)))
         return Imagination(
             torch.stack(feats),
             torch.stack([state.stoch for state in states]),
             torch.stack([state.deter for state in states]),
             torch.stack(actions),
-            torch.stack(entropies),
+            policy.entropy(),
         )
 
     def update(
