@@ -79,6 +79,7 @@ def test_robot_state_takes_only_what_a_robot_may_know() -> None:
         ("PickCube-v1", {"visuals": "heavy"}, "one of auto, light, full"),
         ("PickCube-v1", {"image_size": 0}, "image_size"),
         ("PickCube-v1", {"image_size": (32, 32, 3)}, "image_size"),
+        ("PickCube-v1", {"image_size": 32.5}, "image_size"),
         ("PickCube-v1", {"n_points": -1}, "n_points"),
         ("PickCube-v1", {"goal_points": 1.5}, "goal_points"),
         ("PickCube-v1", {"max_distance": 0.0}, "max_distance"),

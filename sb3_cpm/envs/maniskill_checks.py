@@ -42,7 +42,7 @@ def check_sizes(
     :return: height and width of the images
     :raises ValueError: if a number is of no use
     """
-    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+    size = tuple(image_size) if isinstance(image_size, (tuple, list)) else (image_size, image_size)
     if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
         raise ValueError(f"image_size must be a positive number of pixels or (height, width), got {image_size!r}.")
     if max_episode_steps is not None and max_episode_steps < 1:

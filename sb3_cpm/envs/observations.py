@@ -54,9 +54,8 @@ def camera_points(
     """
     The coloured points that one camera sees, without background and without what is far away.
 
-    Id 0 is where a ray hits nothing. Far pixels must go by their id or distance *in the camera's frame*: beyond 32 m the
-    int16 millimetres wrap around and a point of the horizon would appear next to the robot. ManiSkill clamps nothing, so a
-    far object may wrap into the range too; ManiSkill's tables and cabinets are much nearer than that.
+    Id 0 is where a ray hits nothing. The horizon must go by its id, not by its distance: beyond 32 m the int16 millimetres
+    wrap around, and a point of the floor far away would appear next to the robot.
 
     :param rgb: shape ``(height, width, 3)``, uint8
     :param position: millimetres, shape ``(height, width, 3)``, int16
@@ -67,11 +66,14 @@ def camera_points(
     :return: shape ``(n, 6)`` with any n from 0 to height * width, float32
     """
     ids = segmentation.reshape(-1)
-    distance = np.linalg.norm(position.reshape(-1, 3).astype(np.float32), axis=1) * np.float32(1e-3)
-    keep = (ids != 0) & ~np.isin(ids, list(background_ids)) & (distance <= max_distance)
-    colors = rgb.reshape(-1, 3)[keep].astype(np.float32) / np.float32(255)
-    points = world_points(position.reshape(-1, 3)[keep], cam2world)
-    return np.concatenate([points, colors], axis=1)
+    keep = ids != 0
+    for background_id in background_ids:
+        keep &= ids != background_id
+    index = np.flatnonzero(keep)  # few are left: what follows costs next to nothing
+    position = position.reshape(-1, 3)[index]
+    near = np.linalg.norm(position.astype(np.float32), axis=1) <= np.float32(1e3 * max_distance)
+    colors = rgb.reshape(-1, 3)[index[near]].astype(np.float32) / np.float32(255)
+    return np.concatenate([world_points(position[near], cam2world), colors], axis=1)
 
 
 def resize_cloud(cloud: np.ndarray, n_points: int, rng: np.random.Generator, fallback: np.ndarray) -> np.ndarray:
