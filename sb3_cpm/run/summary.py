@@ -10,6 +10,7 @@ from sb3_cpm.run.folder import write_text
 
 #: Rows of the time table in this order, where there are such; all other sections of the stopwatch follow.
 SECTIONS = (
+    "set-up",
     "simulate+render",
     "P acts",
     "P trains",
@@ -21,6 +22,8 @@ SECTIONS = (
     "evaluation",
     "pictures and saving",
 )
+#: What doesn't count for the speed of training.
+NOT_TRAINING = ("set-up", "evaluation", "pictures and saving")
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Summary:
     :param steps: environment steps taken
     :param episodes: episodes that training completed
     :param seconds: wall-clock time from start to end, evaluations and pictures included
-    :param steps_per_second: steps over the time of training, which is all but evaluations and pictures
+    :param steps_per_second: steps over the time of training, which is all but set-up, evaluations and pictures
     :param first_success: success rate of the first evaluation, None without one
     :param success: of the last
     :param first_return: mean return of the first evaluation
@@ -148,4 +151,4 @@ def peak_memory_gb() -> float:
 def _from_to(first: float | None, last: float | None, form: str) -> str:
     if last is None or first is None:
         return "-"
-    return f"{form.format(first)} at the start, {form.format(last)} at the end"
+    return f"{form.format(first)} in the first evaluation, {form.format(last)} in the last"

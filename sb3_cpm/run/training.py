@@ -33,7 +33,7 @@ from sb3_cpm.run.evaluation import FIRST_SEED, Evaluator, play_episode, success_
 from sb3_cpm.run.gallery import challenge_gallery
 from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.settings import TrainSettings
-from sb3_cpm.run.summary import Summary, complete_times, peak_memory_gb
+from sb3_cpm.run.summary import NOT_TRAINING, Summary, complete_times, peak_memory_gb
 from sb3_cpm.run.video import write_video
 
 #: Trajectories in the challenge gallery.
@@ -82,6 +82,7 @@ class Run:
             self.challenger = make_challenger(settings)
             undo.pop_all()
         self._describe()
+        self.setup_seconds = time.perf_counter() - self.started
 
     def _describe(self) -> None:
         run_folder.write_yaml(self.folder / "config.yml", self.settings.as_dict())
@@ -123,7 +124,7 @@ class Run:
                 if self.model.num_timesteps == 0:
                     self._discard()
                 else:
-                    self._finish(_describe_end(error))
+                    self._finish(_describe_end(error)).show()
             raise
         with _no_second_interrupt():
             summary = self._finish("finished")
@@ -204,8 +205,8 @@ class Run:
     def _summary(self, outcome: str) -> Summary:
         counters = self.challenger.buffer.counters if isinstance(self.model.replay_buffer, CPMBuffer) else None
         seconds = time.perf_counter() - self.started
-        times = complete_times(dict(self.challenger.stopwatch.seconds), seconds)
-        training = seconds - times.get("evaluation", 0.0) - times.get("pictures and saving", 0.0)
+        times = complete_times({"set-up": self.setup_seconds, **self.challenger.stopwatch.seconds}, seconds)
+        training = seconds - sum(times.get(name, 0.0) for name in NOT_TRAINING)
         results = self.evaluator.results
         first, last = (results[0][1], results[-1][1]) if results else (None, None)
         challenger = self.challenger.challenger
