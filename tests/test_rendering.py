@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_cpm.envs import rendering, vulkan
+from sb3_cpm.envs import rendering, vulkan, vulkan_install
 
 NOWHERE = {"VK_DRIVER_FILES": "/nonexistent.json", "VK_ICD_FILENAMES": "/nonexistent.json"}
 """A machine without Vulkan, as far as Vulkan's loader can tell."""
@@ -40,7 +40,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 # ---------------------------------------------------------------------- package sources
 def test_backports_copy_mirror_and_key_of_the_release() -> None:
-    made = vulkan.backports_source({"debian.sources": DEB822}, "bookworm")
+    made = vulkan_install.backports_source({"debian.sources": DEB822}, "bookworm")
     assert made == (
         "sb3-cpm-backports.sources",
         "Types: deb\nURIs: http://mirror.example/debian\nSuites: bookworm-backports\nComponents: main\n"
@@ -52,7 +52,7 @@ def test_backports_from_the_old_format() -> None:
     text = (
         "# deb http://old.example bookworm main\ndeb [signed-by=/key.gpg] http://mirror.example/debian bookworm main contrib\n"
     )
-    made = vulkan.backports_source({"sources.list": text}, "bookworm")
+    made = vulkan_install.backports_source({"sources.list": text}, "bookworm")
     expected = "deb [signed-by=/key.gpg] http://mirror.example/debian bookworm-backports main contrib\n"
     assert made == ("sb3-cpm-backports.list", expected)
 
@@ -67,17 +67,17 @@ def test_backports_from_the_old_format() -> None:
     ],
 )
 def test_no_backports_where_they_make_no_sense(text: str, codename: str | None) -> None:
-    assert vulkan.backports_source({"debian.sources": text}, codename) is None
+    assert vulkan_install.backports_source({"debian.sources": text}, codename) is None
 
 
 def test_newest_suite_wants_a_mesa_that_sapien_can_use() -> None:
     old = "mesa-vulkan-drivers | 22.3.6-1+deb12u1 | http://mirror.example/debian bookworm/main amd64 Packages\n"
     new = "mesa-vulkan-drivers | 25.0.7-2~bpo12+1 | http://mirror.example/debian bookworm-backports/main amd64 Packages\n"
     source = "mesa | 26.0.0-1 | http://mirror.example/debian sid/main Sources\n"
-    assert vulkan.newest_suite(old + new + source) == "bookworm-backports"
-    assert vulkan.newest_suite(old + source) is None
-    assert vulkan.newest_suite("") is None
-    assert vulkan.newest_suite(old.replace("22.3.6", "1:24.3.0")) == "bookworm"
+    assert vulkan_install.newest_suite(old + new + source) == "bookworm-backports"
+    assert vulkan_install.newest_suite(old + source) is None
+    assert vulkan_install.newest_suite("") is None
+    assert vulkan_install.newest_suite(old.replace("22.3.6", "1:24.3.0")) == "bookworm"
 
 
 # ---------------------------------------------------------------------- what SAPIEN says

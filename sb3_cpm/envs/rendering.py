@@ -4,7 +4,8 @@ when an environment is made.
 
 SAPIEN draws with Vulkan. Whether that works cannot be asked politely: without a driver SAPIEN raises, with an odd driver the
 process dies. So :func:`probe_renderer` tries it in a child process, :func:`setup_rendering` installs software Vulkan where the
-probe fails (:mod:`sb3_cpm.envs.vulkan`), and :func:`ensure_renderer` is the fast part that every environment goes through.
+probe fails (:mod:`sb3_cpm.envs.vulkan_install`), and :func:`ensure_renderer` is the fast part, which every environment goes
+through.
 """
 
 import contextlib
@@ -21,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_cpm.envs import vulkan
+from sb3_cpm.envs import vulkan, vulkan_install
 
 SOFTWARE = ("llvmpipe", "swiftshader")
 """Parts of the device names of renderers that run on the CPU."""
@@ -301,10 +302,10 @@ def setup_rendering(private: bool = False) -> int:
     try:
         if os.geteuid() == 0 and not private:
             print("Rendering: installing Mesa's software Vulkan (lavapipe) for the whole machine ...", flush=True)
-            vulkan.install_system(print)
+            vulkan_install.install_system(print)
         else:
             print(f"Rendering: installing Mesa's software Vulkan (lavapipe) into {vulkan.private_folder()} ...", flush=True)
-            vulkan.install_private(print)
+            vulkan_install.install_private(print)
     except (RuntimeError, OSError) as error:
         print(f"Rendering: FAILED. {error}")
         print("Cure: see to the above (network? package sources? free space: 400 MB), then run this again.")
