@@ -4,33 +4,77 @@ Observations stored once.
 ``DictReplayBuffer`` keeps every observation twice, as ``obs`` of one transition and as ``next_obs`` of the one before.
 Within an episode they are the same array, so the next observation of a transition is read here from the following slot;
 only the last observation of an episode, which no transition starts from, needs a place of its own.
+
+The next observation of the newest transition has no slot yet: the following ``add()`` brings it once more, as ``obs``. Until
+then it waits beside the ring. An example of four slots::
+
+    row       0    1    2    3
+              s5   s1   s2   s3      the newest transition, (s5, s6), is in row 0: s6 waits
+              s5   s6   s2   s3      now (s6, s7) is in row 1: s7 waits, and the episode that s1 began is forgotten
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from sb3_cpm.allocation import Allocate
+from sb3_cpm.compact import Codec
+
+
+class Transitions(NamedTuple):
+    """
+    Where the observations of ``n`` transitions are; made once and used for every key.
+
+    :param here: flat slots (row * n_envs + environment) of their observations
+    :param following: flat slots of their next observations, where those are in the ring
+    :param ended: which of the n end an episode, so that their next observation is among the final ones
+    :param final: the slots there, one for each of ``ended``
+    :param waiting: which of the n have a next observation that waits beside the ring
+    :param waiting_envs: and their environments
+    """
+
+    here: np.ndarray
+    following: np.ndarray
+    ended: np.ndarray
+    final: np.ndarray
+    waiting: np.ndarray
+    waiting_envs: np.ndarray
 
 
 class FinalObservations:
     """
     One slot for the last observation of every episode, per observation key; grows as needed, slots are reused.
 
-    :param shapes: observation shape per key
-    :param dtypes: dtype per key
+    :param codecs: how each key is stored
+    :param allocate: makes the arrays
     """
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], dtypes: Mapping[str, Any]):
-        self.arrays = {key: np.zeros((0, *shape), dtype=dtypes[key]) for key, shape in shapes.items()}
+    def __init__(self, codecs: Mapping[str, Codec], allocate: Allocate):
+        self._codecs = codecs
+        self._allocate = allocate
+        self.arrays = {key: allocate(f"final_{key}", (0, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()}
         self._free: list[int] = []
+
+    def reserve(self, n: int) -> None:
+        """Make sure that ``n`` observations can be stored. Only this can fail, for want of memory or disk."""
+        if len(self._free) >= n:
+            return
+        used = len(next(iter(self.arrays.values())))
+        grown = used + max(16, n, used // 4)
+        arrays = {}
+        for key, array in self.arrays.items():
+            arrays[key] = self._allocate(f"final_{key}", (grown, *array.shape[1:]), array.dtype)
+            arrays[key][:used] = array
+        self.arrays = arrays
+        self._free.extend(range(grown - 1, used - 1, -1))
 
     def store(self, observation: Mapping[str, np.ndarray]) -> int:
         """
-        :param observation: one observation, without environment dimension
+        :param observation: one stored observation, without environment dimension
         :return: its slot
         """
-        if not self._free:
-            self._grow()
+        self.reserve(1)
         slot = self._free.pop()
         for key, array in self.arrays.items():
             array[slot] = observation[key]
@@ -39,13 +83,9 @@ class FinalObservations:
     def free(self, slot: int) -> None:
         self._free.append(slot)
 
-    def _grow(self) -> None:
-        used = len(next(iter(self.arrays.values())))
-        grown = max(16, 2 * used)
-        for key, array in self.arrays.items():
-            self.arrays[key] = np.zeros((grown, *array.shape[1:]), dtype=array.dtype)
-            self.arrays[key][:used] = array
-        self._free.extend(range(grown - 1, used - 1, -1))
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in self.arrays.values())
 
 
 class ObservationRing:
@@ -54,55 +94,161 @@ class ObservationRing:
 
     :param size: slots per environment
     :param n_envs: number of environments
-    :param shapes: observation shape per key
-    :param dtypes: dtype per key
+    :param codecs: how each key is stored
+    :param allocate: makes the arrays
     """
 
-    def __init__(self, size: int, n_envs: int, shapes: Mapping[str, tuple[int, ...]], dtypes: Mapping[str, Any]):
+    def __init__(self, size: int, n_envs: int, codecs: dict[str, Codec], allocate: Allocate):
         self.size = size
-        self.observations = {key: np.zeros((size, n_envs, *shape), dtype=dtypes[key]) for key, shape in shapes.items()}
-        self.final = FinalObservations(shapes, dtypes)
+        self.n_envs = n_envs
+        self.codecs = codecs
+        self._allocate = allocate
+        #: In stored form, each of shape ``(size, n_envs, *stored_shape)``
+        self.observations = {
+            key: allocate(key, (size, n_envs, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()
+        }
+        self.final = FinalObservations(codecs, allocate)
         # slot in `final` of the transition's next observation, -1: it is in the following slot of the ring
         self.final_slot = np.full((size, n_envs), -1, dtype=np.int32)
-        # the next observations of the newest transitions have no slot yet: the following add() brings them as `obs`
-        self.newest_next = {key: np.zeros((n_envs, *shape), dtype=dtypes[key]) for key, shape in shapes.items()}
+        self._waiting = {key: np.zeros((n_envs, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()}
         self.newest_row = -1
+        self._compact = [key for key, codec in codecs.items() if not codec.as_it_is]
+        self._waiting_bytes: dict[str, bytes] = {}  # of compact keys: as they were given
+        self._layout = [(key, (n_envs, *codec.shape), codec.dtype, codec) for key, codec in codecs.items()]
+        self._link()
+
+    def _link(self) -> None:
+        self._flat = {
+            key: array.reshape(self.size * self.n_envs, *array.shape[2:]) for key, array in self.observations.items()
+        }
+        self._flat_final_slot = self.final_slot.reshape(-1)
+
+    # ------------------------------------------------------------------ writing
+
+    def encode(self, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        :param observations: of all environments
+        :return: in stored form, not copied where they have it
+        :raises ValueError: for wrong shapes and values that the storage cannot hold
+        """
+        encoded = {}
+        for key, shape, dtype, codec in self._layout:
+            try:
+                array = observations[key]
+            except KeyError:
+                raise ValueError(f"The observations lack {key!r}; the observation space has {sorted(self.codecs)}") from None
+            if not (codec.as_it_is and type(array) is np.ndarray and array.shape == shape and array.dtype == dtype):
+                array = codec.encode(array, self.n_envs)
+            encoded[key] = array
+        return encoded
+
+    def goes_on_with(self, observations: Mapping[str, np.ndarray]) -> bool:
+        """
+        :param observations: of all environments, for the next transitions
+        :return: whether they are, byte by byte, those that wait
+        """
+        if self.newest_row < 0:
+            return False
+        for key, waiting in self._waiting.items():
+            given = observations[key]
+            if type(given) is not np.ndarray:
+                return False
+            if key in self._compact:  # cheaper than to encode it again, and to compare then
+                if self._waiting_bytes.get(key) != given.tobytes():
+                    return False
+            elif not _same_bytes(waiting, given):
+                return False
+        return True
+
+    def write(self, row: int, encoded: Mapping[str, np.ndarray] | None) -> None:
+        """
+        :param row: slot of the next transitions
+        :param encoded: their observations; None: those that wait
+        """
+        if encoded is None:
+            encoded = self._waiting
+        for key, array in self.observations.items():
+            array[row] = encoded[key]
+
+    def write_next(self, row: int, encoded: Mapping[str, np.ndarray], given: Mapping[str, np.ndarray]) -> None:
+        """
+        :param row: slot of the newest transitions
+        :param encoded: the observations that they led to
+        :param given: the same before encoding
+        """
+        for key, array in self._waiting.items():
+            array[...] = encoded[key]
+        for key in self._compact:
+            self._waiting_bytes[key] = np.asarray(given[key]).tobytes()
+        self.newest_row = row
+
+    def newest(self, env_idx: int) -> dict[str, np.ndarray]:
+        """:return: what the newest transition of an environment led to, in stored form"""
+        return {key: array[env_idx] for key, array in self._waiting.items()}
+
+    def continues(self, env_idx: int, encoded: Mapping[str, np.ndarray]) -> bool:
+        """Whether an environment's observation is the one that its newest transition led to, NaN being equal to NaN."""
+        return all(_same(array, encoded[key][env_idx]) for key, array in self.newest(env_idx).items())
 
     def end_episode(self, row: int, env_idx: int) -> None:
         """The newest transition of an environment, in slot ``row``, was the last of its episode: keep its next observation."""
-        self.final_slot[row, env_idx] = self.final.store({key: array[env_idx] for key, array in self.newest_next.items()})
+        self.final_slot[row, env_idx] = self.final.store(self.newest(env_idx))
 
     def drop_episode(self, last_row: int, env_idx: int) -> None:
         """An episode, whose last transition is in slot ``last_row``, is about to be overwritten."""
         self.final.free(int(self.final_slot[last_row, env_idx]))
         self.final_slot[last_row, env_idx] = -1
 
-    def continues(self, env_idx: int, obs: Mapping[str, np.ndarray]) -> bool:
-        """Whether an environment's observation is the one that its newest transition led to."""
-        return all(_same(array[env_idx], obs[key][env_idx]) for key, array in self.newest_next.items())
+    # ------------------------------------------------------------------ reading
 
-    def next_observation(self, key: str, rows: np.ndarray, envs: np.ndarray) -> np.ndarray:
+    def locate(self, rows: np.ndarray, envs: np.ndarray) -> Transitions:
         """
-        :param key: observation key
         :param rows: slots of transitions, shape ``(n,)``
         :param envs: their environments, shape ``(n,)``
-        :return: next observations (a copy), shape ``(n, *observation_shape)``
         """
-        ring = self.observations[key]
-        result = ring[(rows + 1) % self.size, envs]
-        slots = self.final_slot[rows, envs]
-        ended = slots >= 0
-        if ended.any():
-            result[ended] = self.final.arrays[key][slots[ended]]
-        newest = (rows == self.newest_row) & ~ended
-        if newest.any():
-            result[newest] = self.newest_next[key][envs[newest]]
-        return result
+        n_envs = self.n_envs
+        here = rows * n_envs + envs if n_envs > 1 else rows
+        following = here + n_envs
+        following[following >= self.size * n_envs] -= self.size * n_envs
+        slots = self._flat_final_slot.take(here)
+        ended = (slots >= 0).nonzero()[0]
+        waiting = ((rows == self.newest_row) & (slots < 0)).nonzero()[0]
+        return Transitions(here, following, ended, slots[ended], waiting, envs[waiting])
+
+    def read(self, key: str, at: Transitions) -> np.ndarray:
+        """:return: observations (a copy) in the space's dtype, shape ``(n, *observation_shape)``"""
+        return self.codecs[key].decode(self._flat[key].take(at.here, axis=0))
+
+    def read_next(self, key: str, at: Transitions) -> np.ndarray:
+        """:return: next observations (a copy) in the space's dtype, shape ``(n, *observation_shape)``"""
+        result = self._flat[key].take(at.following, axis=0)
+        if len(at.ended):
+            result[at.ended] = self.final.arrays[key].take(at.final, axis=0)
+        if len(at.waiting):
+            result[at.waiting] = self._waiting[key][at.waiting_envs]
+        return self.codecs[key].decode(result)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the ring itself when it is full, without the last observations of episodes."""
-        return sum(array.nbytes for array in self.observations.values())
+        """Bytes that are taken now: the ring, the last observations of episodes, and the books."""
+        ring = sum(array.nbytes for array in self.observations.values())
+        return ring + self.final.nbytes + self.final_slot.nbytes
+
+    # ------------------------------------------------------------------ pickling
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        del state["_flat"], state["_flat_final_slot"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for store, arrays in (("", self.observations), ("final_", self.final.arrays)):
+            for key, array in arrays.items():  # memory-mapped arrays come back as plain ones: put them into files again
+                if isinstance(array, np.memmap):
+                    arrays[key] = self._allocate(f"{store}{key}", array.shape, array.dtype)
+                    arrays[key][...] = array
+        self._link()
 
 
 class NextObservationView:
@@ -116,17 +262,35 @@ class NextObservationView:
     def __init__(self, ring: ObservationRing, key: str):
         self._ring = ring
         self._key = key
+        self.shape = (ring.size, ring.n_envs, *ring.codecs[key].shape)
+        self.dtype = ring.codecs[key].dtype
 
-    def __getitem__(self, index: tuple[Any, ...]) -> np.ndarray:
-        rows, envs = np.broadcast_arrays(np.atleast_1d(index[0]), np.atleast_1d(index[1]))
-        return self._ring.next_observation(self._key, rows, envs)
+    def __getitem__(self, index: Any) -> np.ndarray:
+        index = index if isinstance(index, tuple) else (index,)
+        # the first two indices, of whatever kind, choose transitions; numpy works out which
+        numbers = np.arange(self._ring.size * self._ring.n_envs).reshape(self._ring.size, self._ring.n_envs)[index[:2]]
+        rows, envs = np.divmod(numbers.reshape(-1), self._ring.n_envs)
+        values = self._ring.read_next(self._key, self._ring.locate(rows, envs))
+        values = values.reshape(*numbers.shape, *self.shape[2:])
+        return values[(slice(None),) * numbers.ndim + index[2:]] if len(index) > 2 else values
 
-    def __setitem__(self, row: int, observations: np.ndarray) -> None:
-        self._ring.newest_next[self._key][...] = observations
-        self._ring.newest_row = row
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype=dtype)
+
+
+def _same_bytes(stored: np.ndarray, given: np.ndarray) -> bool:
+    if stored.nbytes < 2048:
+        return stored.tobytes() == given.tobytes()
+    stored, given = (np.ascontiguousarray(array).reshape(-1).view(np.uint8) for array in (stored, given))
+    words = len(stored) // 8 * 8
+    return bool((stored[:words].view(np.uint64) == given[:words].view(np.uint64)).all()) and (
+        stored[words:].tobytes() == given[words:].tobytes()
+    )
 
 
 def _same(stored: np.ndarray, given: np.ndarray) -> bool:
-    """Equality after storage: in the stored dtype and shape, NaN being equal to NaN."""
-    given = np.asarray(given, dtype=stored.dtype).reshape(stored.shape)
-    return np.array_equal(stored, given) or (stored.dtype.kind == "f" and np.array_equal(stored, given, equal_nan=True))
+    if stored.tobytes() == given.tobytes():
+        return True
+    if stored.dtype.kind != "f":
+        return False
+    return np.array_equal(stored, given, equal_nan=True)

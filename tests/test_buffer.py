@@ -151,7 +151,7 @@ def test_against_a_list_of_episodes(n_envs, size, end_probability, mix, seed):
             check_transitions(buffer.sample(8), present)
             check_sequences(buffer.sample_sequences(3, length=int(rng.integers(1, 12))), present)
             if buffer.challenges:
-                check_transitions(buffer._sample_imaginary(8, None), present)
+                check_transitions(buffer._sample_own(0, 8, None), present)
             if rng.random() < 0.3:
                 buffer = played.buffer = pickle.loads(pickle.dumps(buffer))
                 buffer.has_challenger = True
@@ -270,14 +270,14 @@ def test_an_environment_reset_from_outside_ends_the_episode():
     played.episode[0], played.step[0], played.began[0] = 2, 0, played.n_steps
     played.play_episode(5)
     assert [episode.length for episode in played.buffer.episodes] == [6, 4, 5]
-    check_transitions(played.buffer._sample_original(200, None)[0], played.present())
+    check_transitions(played.buffer._sample_own(200, 0, None), played.present())
     check_sequences(played.buffer.sample_sequences(50, 8), played.present())
 
 
 def test_an_episode_that_fills_the_buffer_exactly_and_one_that_does_not_fit():
     played = Played(size=12)
     played.play_episode(12)
-    check_transitions(played.buffer._sample_original(100, None)[0], played.present())
+    check_transitions(played.buffer._sample_own(100, 0, None), played.present())
     played.play_episode(12)
     check_sequences(played.buffer.sample_sequences(10, 13), played.present())
     with pytest.raises(ValueError, match="longer than the 12 transitions .* buffer_size"):

@@ -5,7 +5,7 @@ Lines 9 to 18 of Algorithm 1 in the report: score every transition, choose the g
 this needs (six coefficients, three tolerances, the reward memory) is here, in plain numbers, and is pickled with the buffer.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +123,31 @@ class ChallengeCurator:
             accepted=accepted,
             coefficients=self.coefficients,
             artificial=artificial,
+        )
+
+    def refresh(self, proposal: Proposal, evaluation: Evaluation) -> Proposal:
+        """
+        The rewards of a challenge that was kept, with a newer evaluation of its trajectory. Where it starts and ends stays, and
+        so do coefficients, tolerances and reward memory: nothing new has happened.
+
+        :param proposal: an accepted one
+        :param evaluation: of the whole trajectory
+        :return: the same with today's uncertainty, score and artificial rewards
+        :raises ValueError: as :meth:`propose`
+        """
+        rewards, disagreement, kl, embeddings = _checked(proposal.rewards, evaluation)
+        uncertainty = self.quality.c1.value * kl + disagreement
+        kept = slice(proposal.first, proposal.goal + 1)
+        return replace(
+            proposal,
+            uncertainty=uncertainty,
+            score=self.quality.c.value * rewards + uncertainty,
+            disagreement=disagreement,
+            kl=kl,
+            coefficients=self.coefficients,
+            artificial=self.reward(
+                rewards[kept], uncertainty[kept], embeddings[proposal.first : proposal.goal + 2], adapt=False
+            ),
         )
 
     @property

@@ -56,19 +56,26 @@ class ArtificialReward:
         self.c_emb = DynamicCoefficient(embedding_ratio, **kwargs)
         self.c_step = DynamicCoefficient(step_ratio, **kwargs)
 
-    def __call__(self, rewards: np.ndarray, uncertainty: np.ndarray, embeddings: np.ndarray) -> ArtificialRewards:
+    def __call__(
+        self, rewards: np.ndarray, uncertainty: np.ndarray, embeddings: np.ndarray, adapt: bool = True
+    ) -> ArtificialRewards:
         """
         Relabel the transitions of a challenge of ``n`` steps.
 
         :param rewards: task rewards r, shape ``(n,)``
         :param uncertainty: u, shape ``(n,)``
         :param embeddings: e of every state from the challenge's start to its goal, shape ``(n + 1, embed_dim)``
+        :param adapt: let the coefficients follow their targets
         :return: artificial rewards and their terms
         """
         d_emb, d_step = embedding_progress(embeddings), step_progress(len(rewards))
-        exploration = self.c_expl.update(uncertainty, rewards) * uncertainty
-        embedding = self.c_emb.update(d_emb, exploration) * d_emb
-        step = self.c_step.update(d_step, exploration) * d_step
+        if adapt:
+            self.c_expl.update(uncertainty, rewards)
+        exploration = self.c_expl.value * uncertainty
+        if adapt:
+            self.c_emb.update(d_emb, exploration)
+            self.c_step.update(d_step, exploration)
+        embedding, step = self.c_emb.value * d_emb, self.c_step.value * d_step
         total = self.scale * (rewards + exploration + embedding + step)
         return ArtificialRewards(total, rewards, exploration, embedding, step)
 
