@@ -9,7 +9,7 @@ SHELL := /bin/bash
 
 VENV := .venv
 EXTRAS := run,maniskill,contrib,tests,dev
-CODE := sb3_cpm tests setup.py
+CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
 
 ifeq ($(ENV),active)
 BIN :=
