@@ -21,7 +21,7 @@ from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
 from sb3_cpm.world_model.checkpoint import check_sizes, read_file, write_file
-from sb3_cpm.world_model.observations import ObservationSpec, check_action_space
+from sb3_cpm.world_model.observations import ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import Sequences, WorldModel, WorldModelOutput
@@ -271,7 +271,7 @@ class Challenger:
         return self.world_model.reward(imagined.feats[1:])
 
     def _tensor(self, array: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-        return torch.as_tensor(array, device=self.device).to(dtype)
+        return to_tensor(array, self.device).to(dtype)
 
     # ---- saving ------------------------------------------------------------------------------------------------------
 

@@ -85,6 +85,14 @@ def test_channel_first_images_are_the_same_to_it() -> None:
     assert results[0] == pytest.approx(results[1], rel=1e-4)
 
 
+def test_read_only_arrays_are_fine_and_stay_as_they_are() -> None:
+    challenger, batch = small(BOTH), random_batch(BOTH, 2)
+    for array in (*batch.observations.values(), *batch[1:]):
+        array.flags.writeable = False
+    follow(challenger, challenger.initial_state(4), batch, slice(0, 8))
+    challenger.train(batch)
+
+
 # ---- judging ---------------------------------------------------------------------------------------------------------
 
 

@@ -24,6 +24,13 @@ def symexp(x: torch.Tensor) -> torch.Tensor:
     return torch.sign(x) * torch.expm1(torch.abs(x))
 
 
+def to_tensor(array: np.ndarray | torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Onto the device, without a copy where possible; torch warns about read-only arrays, so those are copied."""
+    if isinstance(array, np.ndarray) and not array.flags.writeable:
+        array = array.copy()
+    return torch.as_tensor(array, device=device)
+
+
 class Inputs(NamedTuple):
     """
     Preprocessed observations of ``n`` states.
@@ -140,7 +147,7 @@ class ObservationSpec:
     ) -> torch.Tensor:
         if key not in observations:
             raise ValueError(f"Observation key {key!r} is missing, got {sorted(observations)}.")
-        tensor = torch.as_tensor(observations[key], device=device)
+        tensor = to_tensor(observations[key], device)
         shape = self.shapes[key]
         if tuple(tensor.shape[-len(shape) :]) != shape:
             raise ValueError(
