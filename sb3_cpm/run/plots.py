@@ -157,9 +157,7 @@ def coefficients(folder: Path, title: str) -> None:
         _draw_epsilon(panels[0], table, episodes)
         _lines(panels[1], table, "Challenges, counted", [("proposed", GREY), ("kept", GREEN), ("in_buffer", BLUE)])
         panels[1].set_ylabel("challenges")
-        _lines(
-            panels[2], table, "Coefficients of the quality score  S = c r + c1 KL + DISAG", [("c", BLUE), ("c1", ORANGE)], True
-        )
+        _lines(panels[2], table, "Coefficients of the score  S = c r + c1 KL + DISAG", [("c", BLUE), ("c1", ORANGE)], True)
         if table and np.isfinite(table["k"]).any():
             _lines(panels[2], table, "", [("k", PURPLE)], True, {"k": "k in DISAG = exp(k d) - 1"})
         _lines(
@@ -183,10 +181,11 @@ def coefficients(folder: Path, title: str) -> None:
 
 
 def _settled(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Coefficients mean nothing before the first proposal has set their magnitude: left out until then."""
+    """Coefficients mean nothing before the first proposal (or challenge) has set their magnitude: left out until then."""
     if table:
-        for name in ("c", "c1", "c_expl", "c_emb", "c_step", "k"):
-            table[name] = np.where(table["proposed"] > 0, table[name], np.nan)
+        for count, names in (("proposed", ("c", "c1", "k")), ("kept", ("c_expl", "c_emb", "c_step"))):
+            for name in names:
+                table[name] = np.where(table[count] > 0, table[name], np.nan)
     return table
 
 

@@ -12,10 +12,11 @@ TASK_DEFAULTS: dict[str, dict[str, Any]] = {
         "steps": 5000,
         "gamma": 0.8,
         "tau": 0.01,
+        "ent_coef": "auto_0.01",
         # an episode goes on after success: else, with rewards above zero, hovering beside the goal pays more than success
         "env_kwargs": {"ignore_terminations": True},
     },
-    "CPMToy-v0": {"steps": 3000, "gamma": 0.9, "tau": 0.01},
+    "CPMToy-v0": {"steps": 2000, "gamma": 0.9, "tau": 0.01},
 }
 
 
@@ -39,6 +40,8 @@ class TrainSettings:
     :param learning_rate: of the player
     :param gamma: discount factor of the player; None: the task's own, else 0.99
     :param tau: soft update of the player's target networks; None: the task's own, else 0.005
+    :param ent_coef: entropy coefficient of SAC and TQC; None: the task's own, else "auto_0.05". The rewards of normalized
+        tasks are small: beside SB3's first value of 1 a short run would see nothing but entropy
     :param train_freq: environment steps between two updates of the player
     :param gradient_steps: updates then
     :param learning_starts: steps before the first update; None: four episodes
@@ -71,6 +74,7 @@ class TrainSettings:
     learning_rate: float = 3e-4
     gamma: float | None = None
     tau: float | None = None
+    ent_coef: str | None = None
     train_freq: int = 2
     gradient_steps: int = 1
     learning_starts: int | None = None
@@ -112,6 +116,7 @@ class TrainSettings:
             steps=steps,
             gamma=0.99 if settings.gamma is None else settings.gamma,
             tau=0.005 if settings.tau is None else settings.tau,
+            ent_coef="auto_0.05" if settings.ent_coef is None else settings.ent_coef,
             buffer_size=settings.buffer_size or min(max(steps, 1000 * settings.n_envs), 20_000),
         )
 

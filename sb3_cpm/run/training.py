@@ -255,8 +255,11 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
         "learning_starts": learning_starts,
         "seed": settings.seed,
         "device": settings.device,
-        **settings.model_kwargs,
     }
+    if settings.algorithm != "td3":
+        coefficient = settings.ent_coef or "auto"
+        kwargs["ent_coef"] = coefficient if coefficient.startswith("auto") else float(coefficient)
+    kwargs.update(settings.model_kwargs)
     kwargs["replay_buffer_class"] = CPMBuffer
     kwargs["replay_buffer_kwargs"] = {"challenge_ratio": settings.challenge_ratio, **settings.buffer_kwargs}
     policy, policy_kwargs = _policy(settings.algorithm, env)
