@@ -75,7 +75,7 @@ class TrainSettings:
     gamma: float | None = None
     tau: float | None = None
     ent_coef: str | None = None
-    train_freq: int = 2
+    train_freq: int = 1
     gradient_steps: int = 1
     learning_starts: int | None = None
     challenger_train_freq: int = 25
