@@ -55,8 +55,8 @@ class InFolder:
         except OSError as error:
             path.unlink(missing_ok=True)
             raise ValueError(
-                f"Cannot reserve {_gb(n_bytes)} for {name!r} in {self.directory} ({error.strerror}); {_gb(free_on_disk(self.directory))} "
-                "are free there. Use a smaller buffer_size or another memmap_dir."
+                f"Cannot reserve {_gb(n_bytes)} for {name!r} in {self.directory} ({error.strerror}); "
+                f"{_gb(free_on_disk(self.directory))} are free there. Use a smaller buffer_size or another memmap_dir."
             ) from error
         array = np.memmap(path, dtype=dtype, mode="r+", shape=shape)
         path.unlink()  # the map keeps the blocks; nothing is left behind if the process is killed

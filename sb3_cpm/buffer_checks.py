@@ -9,6 +9,25 @@ import numpy as np
 from gymnasium import spaces
 
 
+def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_keys: Sequence[str] | None) -> None:
+    """:raises ValueError: for observations that a buffer cannot hold, or that lack what its arguments ask for"""
+    if not isinstance(observation_space, spaces.Dict):
+        raise ValueError(
+            f"CPMBuffer needs a Dict observation space, got {observation_space}. Wrap the environment in "
+            'sb3_cpm.envs.DictObservation(env) and use "MultiInputPolicy" (SAC, TD3, DDPG and TQC have one, CrossQ has none).'
+        )
+    missing = {"achieved_goal", "desired_goal"} - set(observation_space.spaces)
+    if n_sampled_goal > 0 and missing:
+        raise ValueError(
+            f"n_sampled_goal={n_sampled_goal} asks for hindsight goals, but the observations have no {sorted(missing)}; "
+            "use n_sampled_goal=0 on an environment without goals."
+        )
+    unknown = set(player_keys or ()) - set(observation_space.spaces)
+    if unknown:
+        known = sorted(observation_space.spaces)
+        raise ValueError(f"player_keys {sorted(unknown)} are not among the observation keys {known}")
+
+
 def check_arguments(
     observation_space: spaces.Space,
     action_space: spaces.Space,
@@ -17,19 +36,15 @@ def check_arguments(
     mix: str,
     max_challenges: int,
     refresh_every: int | None,
-    n_sampled_goal: int,
-    player_keys: Sequence[str] | None,
 ) -> None:
     """:raises ValueError: for arguments of CPMBuffer that cannot work"""
-    if not isinstance(observation_space, spaces.Dict):
-        raise ValueError(
-            f"CPMBuffer needs a Dict observation space, got {observation_space}. Wrap the environment in "
-            'sb3_cpm.envs.DictObservation(env) and use "MultiInputPolicy" (SAC, TD3, DDPG and TQC have one, CrossQ has none).'
-        )
+    check_spaces(observation_space, 0, None)
     for name, share in (("challenge_ratio", challenge_ratio), ("demonstration_ratio", demonstration_ratio)):
         if not 0 <= share <= 1:
             raise ValueError(f"{name} is a share of the batches and must lie in [0, 1], got {share}")
-    if challenge_ratio + demonstration_ratio > 1 and demonstration_ratio != 0.1:  # 0.1: the default, unused without demonstrations
+    if (
+        challenge_ratio + demonstration_ratio > 1 and demonstration_ratio != 0.1
+    ):  # 0.1: the default, unused without demonstrations
         raise ValueError(
             f"challenge_ratio={challenge_ratio} and demonstration_ratio={demonstration_ratio} are shares of the same batches and must "
             "not exceed 1 together"
@@ -42,18 +57,11 @@ def check_arguments(
     if mix not in ("batch", "row"):
         raise ValueError(f'mix must be "batch" or "row", got {mix!r}')
     if max_challenges < 1:
-        raise ValueError(f"max_challenges must be at least 1, got {max_challenges}; use challenge_ratio=0 for no challenges")
+        raise ValueError(f"max_challenges must be at least 1, got {max_challenges}; use challenge_ratio=0 for none")
     if refresh_every is not None and refresh_every < 1:
-        raise ValueError(f"refresh_every is a number of transitions and must be at least 1, or None for never, got {refresh_every}")
-    missing = {"achieved_goal", "desired_goal"} - set(observation_space.spaces)
-    if n_sampled_goal > 0 and missing:
         raise ValueError(
-            f"n_sampled_goal={n_sampled_goal} asks for hindsight goals, but the observations have no {sorted(missing)}; "
-            "use n_sampled_goal=0 on an environment without goals."
+            f"refresh_every is a number of transitions and must be at least 1, or None for never, got {refresh_every}"
         )
-    unknown = set(player_keys or ()) - set(observation_space.spaces)
-    if unknown:
-        raise ValueError(f"player_keys {sorted(unknown)} are not among the observation keys {sorted(observation_space.spaces)}")
 
 
 def checked_rewards(reward: np.ndarray, n_envs: int) -> np.ndarray:
@@ -67,8 +75,8 @@ def checked_rewards(reward: np.ndarray, n_envs: int) -> np.ndarray:
     for env_idx, value in enumerate(values):
         if not math.isfinite(value):
             raise ValueError(
-                f"Environment {env_idx} gave a reward of {value}: rewards must be finite. stable_baselines3.common.vec_env.VecCheckNan "
-                "helps to find where it comes from."
+                f"Environment {env_idx} gave a reward of {value}: rewards must be finite. "
+                "stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
             )
     return reward
 
@@ -78,20 +86,20 @@ def check_environment(env: Any, observation_space: spaces.Dict, action_space: sp
     theirs = getattr(env, "observation_space", None)
     if isinstance(theirs, spaces.Space) and _layout(theirs) != _layout(observation_space):
         raise ValueError(
-            f"This replay buffer holds observations {_layout(observation_space)}, the environment gives {_layout(theirs)}: it belongs "
-            "to another environment."
+            f"This replay buffer holds observations {_layout(observation_space)}, the environment gives {_layout(theirs)}: it "
+            "belongs to another environment."
         )
     actions = getattr(env, "action_space", None)
     if isinstance(actions, spaces.Space) and actions.shape != action_space.shape:
         raise ValueError(
-            f"This replay buffer holds actions {action_space}, the environment takes {actions}: it belongs to another environment "
-            "or controller."
+            f"This replay buffer holds actions {action_space}, the environment takes {actions}: it belongs to another "
+            "environment or controller."
         )
     n_theirs = getattr(env, "num_envs", n_envs)
     if n_theirs != n_envs:
         raise ValueError(
-            f"This replay buffer was filled by {n_envs} parallel environments, now there are {n_theirs}. Load it into a model with "
-            f"{n_envs}, they are its columns."
+            f"This replay buffer was filled by {n_envs} parallel environments, now there are {n_theirs}. Load it into a model "
+            f"with {n_envs}, they are its columns."
         )
 
 
@@ -105,6 +113,6 @@ def unreadable(path: str | Path, error: Exception) -> ValueError:
     """What to say of a file that pickle cannot read."""
     size = Path(path).stat().st_size
     return ValueError(
-        f"{path} ({size:,} bytes) is not a complete saved CPMBuffer: {error or type(error).__name__}. It may have been cut off while "
-        "it was written (CPMBuffer.save never leaves half a file); take an earlier one."
+        f"{path} ({size:,} bytes) is not a complete saved CPMBuffer: {error or type(error).__name__}. It may have been cut off "
+        "while it was written (CPMBuffer.save never leaves half a file); take an earlier one."
     )

@@ -5,10 +5,12 @@ A point cloud of 32-bit floats knows its points to fractions of a micrometre, wh
 numbers before they became floats. Storing them as what they are quarters their memory.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 #: ``"float16"``, ``("uint8", low, high)``, or a list of such, one per feature of the last axis
@@ -82,11 +84,13 @@ class _CastCodec(Codec):
                 return values.astype(self.stored_dtype)
         except FloatingPointError:
             raise ValueError(
-                f"Observation {self.key!r} holds values up to {np.abs(values).max():.4g}, too large for {self.stored_dtype} (up to "
-                f"{np.finfo(self.stored_dtype).max:.4g}). Leave it out of storage_dtypes."
+                f"Observation {self.key!r} holds values up to {np.abs(values).max():.4g}, too large for {self.stored_dtype} "
+                f"(up to {np.finfo(self.stored_dtype).max:.4g}). Leave it out of storage_dtypes."
             ) from None
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
+        if self.dtype == np.float32:  # several times faster in torch than in NumPy
+            return th.from_numpy(np.ascontiguousarray(stored)).float().numpy()
         return stored.astype(self.dtype)
 
 
@@ -104,8 +108,8 @@ class _ScaledCodec(Codec):
         self.stored_dtype = np.dtype(stored_dtype)
         if not (np.isfinite([low, high]).all() and low < high):
             raise ValueError(
-                f"storage_dtypes[{key!r}]: storing floats as {stored_dtype} needs finite bounds, got [{low}, {high}]. Give them, for "
-                f'instance ("{stored_dtype}", 0.0, 1.0).'
+                f"storage_dtypes[{key!r}]: storing floats as {stored_dtype} needs finite bounds, got [{low}, {high}]. Give "
+                f'them, for instance ("{stored_dtype}", 0.0, 1.0).'
             )
         self.low, self.high = float(low), float(high)
         self.levels = np.iinfo(self.stored_dtype).max
@@ -115,56 +119,68 @@ class _ScaledCodec(Codec):
         return self.encode_part(self._in_shape(observations, n_envs))
 
     def encode_part(self, values: np.ndarray) -> np.ndarray:
-        shares = (values - self.low) / (self.high - self.low)
-        if not (shares.min(initial=0.0) >= -self.TOLERANCE and shares.max(initial=1.0) <= 1 + self.TOLERANCE):  # NaN fails too
+        levels = (values - self.low) / self.step
+        slack = self.TOLERANCE * self.levels
+        if not (levels.min() >= -slack and levels.max() <= self.levels + slack):  # NaN fails too
             raise ValueError(
-                f"Observation {self.key!r} holds values in [{values.min():.4g}, {values.max():.4g}], but storage_dtypes declares "
-                f"[{self.low:g}, {self.high:g}] for {self.stored_dtype}. Declare bounds that hold."
+                f"Observation {self.key!r} holds values in [{values.min():.4g}, {values.max():.4g}], but storage_dtypes "
+                f"declares [{self.low:g}, {self.high:g}] for {self.stored_dtype}. Declare bounds that hold."
             )
-        return np.rint(np.clip(shares, 0, 1) * self.levels).astype(self.stored_dtype)
+        np.rint(levels, out=levels)
+        return np.minimum(np.maximum(levels, 0), self.levels).astype(self.stored_dtype)
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
-        values = stored * self.step
+        values = stored.astype(self.dtype)
+        values *= self.step
         if self.low:
             values += self.dtype.type(self.low)
         return values
 
 
 class _ColumnsCodec(Codec):
-    """Groups of features of the last axis, each stored in its own way, side by side in one record per observation."""
+    """
+    Groups of features of the last axis, each stored in its own way, in one record per observation: feature by feature, which
+    is several times faster to read than point by point.
+    """
 
     def __init__(self, key: str, shape: tuple[int, ...], dtype: Any, columns: Sequence[StorageSpec]):
         super().__init__(key, shape, dtype)
         if not shape or len(columns) != shape[-1]:
             raise ValueError(
-                f"storage_dtypes[{key!r}] lists {len(columns)} features, but the last axis of {shape} has {shape[-1] if shape else 0}"
+                f"storage_dtypes[{key!r}] lists {len(columns)} features, but the observations have the shape {shape}"
             )
         starts = [0, *(i for i in range(1, len(columns)) if columns[i] != columns[i - 1]), len(columns)]
         self.parts: list[tuple[slice, str, Any]] = []
         fields = []
-        for number, (start, stop) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+        for number, (start, stop) in enumerate(itertools.pairwise(starts)):
             part_shape = (*shape[:-1], stop - start)
             codec = _simple_codec(key, part_shape, dtype, columns[start], None)
             self.parts.append((slice(start, stop), f"part{number}", codec))
-            fields.append((f"part{number}", codec.stored_dtype, part_shape))
+            fields.append((f"part{number}", codec.stored_dtype, (stop - start, *shape[:-1])))
         self.stored_dtype = np.dtype(fields)
         self.stored_shape = ()
 
     def encode(self, observations: np.ndarray, n_envs: int) -> np.ndarray:
-        observations = self._in_shape(observations, n_envs)
+        features = np.moveaxis(self._in_shape(observations, n_envs), -1, 1)
         stored = np.empty(n_envs, dtype=self.stored_dtype)
         for columns, name, codec in self.parts:
-            stored[name] = codec.encode_part(observations[..., columns])
+            stored[name] = codec.encode_part(features[:, columns])
         return stored
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
         values = np.empty((*stored.shape, *self.shape), dtype=self.dtype)
+        features = np.moveaxis(values, -1, stored.ndim)
+        every: tuple[Any, ...] = (slice(None),) * stored.ndim
         for columns, name, codec in self.parts:
-            values[..., columns] = codec.decode(stored[name])
+            decoded = codec.decode(stored[name])
+            for number, column in enumerate(range(columns.start, columns.stop)):
+                features[(*every, column)] = decoded[(*every, number)]
         return values
 
 
-def make_codecs(space: spaces.Dict, shapes: dict[str, tuple[int, ...]], specs: dict[str, StorageSpec] | None) -> dict[str, Codec]:
+def make_codecs(
+    space: spaces.Dict, shapes: dict[str, tuple[int, ...]], specs: dict[str, StorageSpec] | None
+) -> dict[str, Codec]:
     """
     :param space: observation space
     :param shapes: shape of one stored observation per key (discrete ones have (1,))
@@ -198,7 +214,7 @@ def _is_scaled(spec: StorageSpec) -> bool:
 def _simple_codec(key: str, shape: tuple[int, ...], dtype: Any, spec: StorageSpec, space: spaces.Space | None) -> Any:
     if not (isinstance(spec, str) or _is_scaled(spec)):
         raise ValueError(f'storage_dtypes[{key!r}]: expected "float16", ("uint8", low, high) or one per feature, got {spec!r}')
-    name, *bounds = (spec,) if isinstance(spec, str) else spec
+    name, *bounds = [spec] if isinstance(spec, str) else list(spec)
     try:
         stored_dtype = np.dtype(name)
     except TypeError:
@@ -206,7 +222,9 @@ def _simple_codec(key: str, shape: tuple[int, ...], dtype: Any, spec: StorageSpe
     if stored_dtype.kind == "f" and not bounds:
         return _CastCodec(key, shape, dtype, stored_dtype)
     if stored_dtype.kind != "u":
-        raise ValueError(f"storage_dtypes[{key!r}]: floats can be stored as float16, or scaled to uint8 or uint16, not {spec!r}")
+        raise ValueError(
+            f"storage_dtypes[{key!r}]: floats can be stored as float16, or scaled to uint8 or uint16, not {spec!r}"
+        )
     if not bounds and isinstance(space, spaces.Box):  # the space declares the scale
         bounds = [float(space.low.min()), float(space.high.max())]
     return _ScaledCodec(key, shape, dtype, stored_dtype, *(bounds or (-np.inf, np.inf)))

@@ -62,13 +62,15 @@ def read_demonstrations(
         for record in index["episodes"]:
             name = f"traj_{record['episode_id']}"
             if name not in file:
-                raise ValueError(f"{path} has no {name}, which {path.with_suffix('.json').name} lists; the files don't belong together")
+                raise ValueError(f"{path} has no {name}, which the .json file lists; the files don't belong together")
             recorded = file[name]
             _check_actions(recorded["actions"].shape[1:], action_space, record, path)
             observations = _recorded_observations(recorded, observation_space)
             if observations is not None and "rewards" in recorded:
                 episodes.append(
-                    Demonstration(observations, recorded["actions"][:], recorded["rewards"][:], bool(recorded["terminated"][-1]))
+                    Demonstration(
+                        observations, recorded["actions"][:], recorded["rewards"][:], bool(recorded["terminated"][-1])
+                    )
                 )
                 continue
             if env is None:
@@ -79,7 +81,9 @@ def read_demonstrations(
             else:
                 episodes.append(episode)
     if failed:
-        logger.warning(f"{path}: {failed} of {len(index['episodes'])} episodes did not succeed when replayed, and were left out")
+        logger.warning(
+            f"{path}: {failed} of {len(index['episodes'])} episodes did not succeed when replayed, and were left out"
+        )
     if not episodes:
         raise ValueError(f"{path}: no episode could be used. Is the environment the one that they were recorded in?")
     return episodes
@@ -89,7 +93,9 @@ def _h5py() -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise ValueError("Reading ManiSkill's trajectory files needs h5py: pip install h5py (it comes with mani_skill)") from error
+        raise ValueError(
+            "Reading ManiSkill's trajectory files needs h5py: pip install h5py (it comes with mani_skill)"
+        ) from error
     return h5py
 
 
@@ -100,15 +106,17 @@ def _read_index(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ValueError(f"A trajectory file comes with a .json file of the same name: there is no {path}") from None
     except (json.JSONDecodeError, KeyError, IndexError, TypeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} does not list episodes as ManiSkill's trajectory files do ({type(error).__name__}: {error})") from None
+        raise ValueError(
+            f"{path} does not list episodes as ManiSkill's trajectory files do ({type(error).__name__}: {error})"
+        ) from None
     return index
 
 
 def _check_actions(shape: tuple[int, ...], space: spaces.Space, record: dict[str, Any], path: Path) -> None:
     if shape != space.shape:
         raise ValueError(
-            f"{path} holds actions of shape {shape} (controller {record.get('control_mode', 'unknown')}), the environment takes "
-            f"{space.shape}. Convert them: python -m mani_skill.trajectory.replay_trajectory --traj-path {path.name} -c "
+            f"{path} holds actions of shape {shape} (controller {record.get('control_mode', 'unknown')}), the environment "
+            f"takes {space.shape}. Convert them: python -m mani_skill.trajectory.replay_trajectory --traj-path {path.name} -c "
             "<the environment's control mode> -o none --save-traj"
         )
 
@@ -133,7 +141,7 @@ def _recorded_observations(recorded: Any, space: spaces.Dict) -> dict[str, np.nd
 def _needs_env(path: Path, index: dict[str, Any], recorded: Any, observations_fit: bool) -> str:
     kwargs = index.get("env_info", {}).get("env_kwargs", {})
     task = index.get("env_info", {}).get("env_id", "?")
-    what = "rewards" if observations_fit else f"observations of this buffer (its obs_mode is {kwargs.get('obs_mode', 'none')!r})"
+    what = "rewards" if observations_fit else f"such observations (its obs_mode is {kwargs.get('obs_mode', 'none')!r})"
     return (
         f"{path} does not hold {what}. Pass env=make_maniskill_env({task!r}, ...), made as for training, and the actions are "
         "replayed in it."
@@ -173,14 +181,18 @@ def _check_start(env: Any, recorded: Any, number: int, seed: int) -> None:
         return
     actors = env.unwrapped.get_state_dict()["actors"]
     for name, states in recorded["env_states"]["actors"].items():
-        if name not in actors or not np.allclose(np.asarray(actors[name].cpu()).reshape(-1)[:3], states[0].reshape(-1)[:3], atol=1e-3):
+        if name not in actors or not np.allclose(
+            np.asarray(actors[name].cpu()).reshape(-1)[:3], states[0].reshape(-1)[:3], atol=1e-3
+        ):
             raise ValueError(
-                f"Episode {number} starts elsewhere when replayed: {name!r} is not where it was after reset(seed={seed}). Make the "
-                "environment with the task, robot_uids and ManiSkill version that it was recorded with."
+                f"Episode {number} starts elsewhere when replayed: {name!r} is not where it was after reset(seed={seed}). "
+                "Make the environment with the task, robot_uids and ManiSkill version that it was recorded with."
             )
 
 
-def as_transitions(episode: Demonstration, observation_space: spaces.Dict, action_space: spaces.Space) -> Iterator[tuple[Any, ...]]:
+def as_transitions(
+    episode: Demonstration, observation_space: spaces.Dict, action_space: spaces.Space
+) -> Iterator[tuple[Any, ...]]:
     """
     :param episode: a demonstration
     :return: for each step, what a buffer's ``add()`` takes, for one environment
@@ -196,11 +208,14 @@ def as_transitions(episode: Demonstration, observation_space: spaces.Dict, actio
         wanted = (n_steps + 1, *(space.shape or ()))
         if np.shape(episode.observations[key]) != wanted:
             raise ValueError(
-                f"A demonstration of {n_steps} steps has observations {key!r} of shape {np.shape(episode.observations[key])}, expected {wanted}"
+                f"A demonstration of {n_steps} steps has observations {key!r} of shape "
+                f"{np.shape(episode.observations[key])}, expected {wanted}"
             )
     actions = np.asarray(episode.actions)
     if actions.shape != (n_steps, *(action_space.shape or ())):
-        raise ValueError(f"A demonstration of {n_steps} steps has actions of shape {actions.shape}, the space is {action_space}")
+        raise ValueError(
+            f"A demonstration of {n_steps} steps has actions of shape {actions.shape}, the space is {action_space}"
+        )
     actions = _scaled(actions, action_space).reshape(n_steps, -1)
     for step in range(n_steps):
         last = step == n_steps - 1

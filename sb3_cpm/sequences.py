@@ -38,7 +38,13 @@ def draw_starts(n_valid: np.ndarray, batch_size: int, length: int) -> tuple[np.n
 
 
 def read_sequences(
-    stored: Stored, oldest: np.ndarray, n_valid: np.ndarray, envs: np.ndarray, offsets: np.ndarray, length: int, keys: Sequence[str]
+    stored: Stored,
+    oldest: np.ndarray,
+    n_valid: np.ndarray,
+    envs: np.ndarray,
+    offsets: np.ndarray,
+    length: int,
+    keys: Sequence[str],
 ) -> SequenceBatch:
     """
     Walk ``length`` rows along each environment, from the state that transition number ``offset`` starts in.

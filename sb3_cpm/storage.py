@@ -24,22 +24,26 @@ from sb3_cpm.compact import Codec
 
 class Transitions(NamedTuple):
     """
-    Where the observations of ``n`` transitions are; made once and used for every key.
+    Where ``n`` transitions are; made once and used for every key.
 
-    :param here: flat slots (row * n_envs + environment) of their observations
+    :param here: flat slots (row * n_envs + environment) of the transitions and their observations
+    :param envs: their environments
+    :param starts: rows that their episodes start in
+    :param steps: their numbers within their episodes
+    :param lengths: lengths of their episodes, 0 for unfinished ones
     :param following: flat slots of their next observations, where those are in the ring
     :param ended: which of the n end an episode, so that their next observation is among the final ones
     :param final: the slots there, one for each of ``ended``
-    :param waiting: which of the n have a next observation that waits beside the ring
-    :param waiting_envs: and their environments
     """
 
     here: np.ndarray
+    envs: np.ndarray
+    starts: np.ndarray
+    steps: np.ndarray
+    lengths: np.ndarray
     following: np.ndarray
     ended: np.ndarray
     final: np.ndarray
-    waiting: np.ndarray
-    waiting_envs: np.ndarray
 
 
 class FinalObservations:
@@ -53,7 +57,9 @@ class FinalObservations:
     def __init__(self, codecs: Mapping[str, Codec], allocate: Allocate):
         self._codecs = codecs
         self._allocate = allocate
-        self.arrays = {key: allocate(f"final_{key}", (0, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()}
+        self.arrays = {
+            key: allocate(f"final_{key}", (0, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()
+        }
         self._free: list[int] = []
 
     def reserve(self, n: int) -> None:
@@ -108,6 +114,8 @@ class ObservationRing:
             key: allocate(key, (size, n_envs, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()
         }
         self.final = FinalObservations(codecs, allocate)
+        #: First row and length of each transition's episode, shape ``(size, n_envs, 2)``; length 0 is "not to be sampled"
+        self.spans = np.zeros((size, n_envs, 2), dtype=np.int64)
         # slot in `final` of the transition's next observation, -1: it is in the following slot of the ring
         self.final_slot = np.full((size, n_envs), -1, dtype=np.int32)
         self._waiting = {key: np.zeros((n_envs, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()}
@@ -122,6 +130,7 @@ class ObservationRing:
             key: array.reshape(self.size * self.n_envs, *array.shape[2:]) for key, array in self.observations.items()
         }
         self._flat_final_slot = self.final_slot.reshape(-1)
+        self._flat_spans = self.spans.reshape(-1, 2)
 
     # ------------------------------------------------------------------ writing
 
@@ -206,14 +215,28 @@ class ObservationRing:
         :param rows: slots of transitions, shape ``(n,)``
         :param envs: their environments, shape ``(n,)``
         """
-        n_envs = self.n_envs
-        here = rows * n_envs + envs if n_envs > 1 else rows
-        following = here + n_envs
-        following[following >= self.size * n_envs] -= self.size * n_envs
-        slots = self._flat_final_slot.take(here)
-        ended = (slots >= 0).nonzero()[0]
-        waiting = ((rows == self.newest_row) & (slots < 0)).nonzero()[0]
-        return Transitions(here, following, ended, slots[ended], waiting, envs[waiting])
+        here = rows * self.n_envs + envs
+        # whether a transition ends its episode is known from what hindsight needs anyway, without another random access
+        starts, lengths = self._flat_spans.take(here, axis=0).T
+        steps = rows - starts
+        steps[steps < 0] += self.size
+        return self._located(here, envs, starts, steps, lengths)
+
+    def locate_later(self, at: Transitions, steps: np.ndarray) -> Transitions:
+        """:return: other transitions of the same episodes, by their numbers"""
+        rows = at.starts + steps
+        rows[rows >= self.size] -= self.size
+        return self._located(rows * self.n_envs + at.envs, at.envs, at.starts, steps, at.lengths)
+
+    def _located(
+        self, here: np.ndarray, envs: np.ndarray, starts: np.ndarray, steps: np.ndarray, lengths: np.ndarray
+    ) -> Transitions:
+        n_slots = self.size * self.n_envs
+        following = here + self.n_envs
+        following[following >= n_slots] -= n_slots
+        ended = (steps == lengths - 1).nonzero()[0]
+        final = self._flat_final_slot.take(here.take(ended))
+        return Transitions(here, envs, starts, steps, lengths, following, ended, final)
 
     def read(self, key: str, at: Transitions) -> np.ndarray:
         """:return: observations (a copy) in the space's dtype, shape ``(n, *observation_shape)``"""
@@ -224,21 +247,23 @@ class ObservationRing:
         result = self._flat[key].take(at.following, axis=0)
         if len(at.ended):
             result[at.ended] = self.final.arrays[key].take(at.final, axis=0)
-        if len(at.waiting):
-            result[at.waiting] = self._waiting[key][at.waiting_envs]
         return self.codecs[key].decode(result)
+
+    def read_newest(self, key: str, envs: np.ndarray) -> np.ndarray:
+        """:return: the next observations of the newest transitions of some environments"""
+        return self.codecs[key].decode(self._waiting[key][envs])
 
     @property
     def nbytes(self) -> int:
         """Bytes that are taken now: the ring, the last observations of episodes, and the books."""
         ring = sum(array.nbytes for array in self.observations.values())
-        return ring + self.final.nbytes + self.final_slot.nbytes
+        return ring + self.final.nbytes + self.final_slot.nbytes + self.spans.nbytes
 
     # ------------------------------------------------------------------ pickling
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
-        del state["_flat"], state["_flat_final_slot"]
+        del state["_flat"], state["_flat_final_slot"], state["_flat_spans"]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -266,11 +291,14 @@ class NextObservationView:
         self.dtype = ring.codecs[key].dtype
 
     def __getitem__(self, index: Any) -> np.ndarray:
+        ring = self._ring
         index = index if isinstance(index, tuple) else (index,)
         # the first two indices, of whatever kind, choose transitions; numpy works out which
-        numbers = np.arange(self._ring.size * self._ring.n_envs).reshape(self._ring.size, self._ring.n_envs)[index[:2]]
-        rows, envs = np.divmod(numbers.reshape(-1), self._ring.n_envs)
-        values = self._ring.read_next(self._key, self._ring.locate(rows, envs))
+        numbers = np.arange(ring.size * ring.n_envs).reshape(ring.size, ring.n_envs)[index[:2]]
+        rows, envs = np.divmod(numbers.reshape(-1), ring.n_envs)
+        values = ring.read_next(self._key, ring.locate(rows, envs))
+        newest = (rows == ring.newest_row) & (ring.spans[rows, envs, 1] == 0)
+        values[newest] = ring.read_newest(self._key, envs[newest])
         values = values.reshape(*numbers.shape, *self.shape[2:])
         return values[(slice(None),) * numbers.ndim + index[2:]] if len(index) > 2 else values
 
@@ -279,13 +307,9 @@ class NextObservationView:
 
 
 def _same_bytes(stored: np.ndarray, given: np.ndarray) -> bool:
-    if stored.nbytes < 2048:
-        return stored.tobytes() == given.tobytes()
-    stored, given = (np.ascontiguousarray(array).reshape(-1).view(np.uint8) for array in (stored, given))
-    words = len(stored) // 8 * 8
-    return bool((stored[:words].view(np.uint64) == given[:words].view(np.uint64)).all()) and (
-        stored[words:].tobytes() == given[words:].tobytes()
-    )
+    if stored.nbytes < 1 << 16 or not given.flags.c_contiguous or given.dtype != stored.dtype:
+        return stored.tobytes() == given.tobytes()  # two copies and memcmp: cheaper than what NumPy has, unless it is large
+    return bool((stored.reshape(-1).view(np.uint8) == given.reshape(-1).view(np.uint8)).all())
 
 
 def _same(stored: np.ndarray, given: np.ndarray) -> bool:

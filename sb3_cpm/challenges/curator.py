@@ -127,8 +127,8 @@ class ChallengeCurator:
 
     def refresh(self, proposal: Proposal, evaluation: Evaluation) -> Proposal:
         """
-        The rewards of a challenge that was kept, with a newer evaluation of its trajectory. Where it starts and ends stays, and
-        so do coefficients, tolerances and reward memory: nothing new has happened.
+        The rewards of a challenge that was kept, with a newer evaluation of its trajectory. Where it starts and ends stays,
+        and so do coefficients, tolerances and reward memory: nothing new has happened.
 
         :param proposal: an accepted one
         :param evaluation: of the whole trajectory

@@ -1,0 +1,548 @@
+"""
+D: whole episodes in a replay buffer that stores every observation once and samples in time independent of its size.
+
+By itself this is a faster ``HerReplayBuffer`` of half the memory; :class:`~sb3_cpm.buffers.CPMBuffer` adds challenges and
+demonstrations. Complete episodes of an environment lie one after another in the ring and end where the unfinished one
+starts, so a transition is drawn by a random number below their total length. Two environments, six slots, e being
+transitions of complete episodes, u of unfinished ones::
+
+    slot            0  1  2  3  4  5
+    environment 0   e  e  e  u  u  .     3 to draw from, the oldest in slot 0
+    environment 1   e  u  u  u  u  .     1, in slot 0: numbers 0 to 3 are the transitions to draw from
+"""
+
+import copy
+import os
+import pickle
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from typing_extensions import Self
+
+from sb3_cpm.allocation import InFolder, check_space, in_memory
+from sb3_cpm.buffer_checks import check_environment, check_spaces, checked_rewards, unreadable
+from sb3_cpm.compact import StorageSpec, make_codecs
+from sb3_cpm.imaginary import Episode
+from sb3_cpm.sequences import draw_starts, read_sequences
+from sb3_cpm.storage import NextObservationView, ObservationRing, Transitions
+from sb3_cpm.type_aliases import SequenceBatch
+
+#: Changes whenever a pickled buffer of an earlier release could be misread.
+FORMAT = 2
+_VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+# Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
+_BOOKS = 3 * 4 + 2 * 8 + 4
+
+
+class EpisodeBuffer(HerReplayBuffer):
+    """
+    Replay buffer of whole episodes, each observation stored once.
+
+    :param buffer_size: max number of transitions
+    :param observation_space: observation space, a Dict
+    :param action_space: action space
+    :param env: the training environment (only used for hindsight goals)
+    :param device: PyTorch device
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: not needed, must be False
+    :param handle_timeout_termination: bootstrap at time limits
+    :param n_sampled_goal: number of hindsight transitions per real one; 0 works on environments without goals
+    :param goal_selection_strategy: one of 'episode', 'final', 'future'
+    :param copy_info_dict: pass the infos to ``compute_reward()``
+    :param storage_dtypes: see :class:`~sb3_cpm.buffers.CPMBuffer`
+    :param memmap_dir: likewise
+    :param player_keys: likewise
+    :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        env: VecEnv | None = None,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_sampled_goal: int = 0,
+        goal_selection_strategy: GoalSelectionStrategy | str = "future",
+        copy_info_dict: bool = False,
+        storage_dtypes: dict[str, StorageSpec] | None = None,
+        memmap_dir: str | Path | None = None,
+        player_keys: Sequence[str] | None = None,
+    ):
+        check_spaces(observation_space, n_sampled_goal, player_keys)
+        # The parent allocates two copies of the observations and a dict per transition: give it a single slot.
+        super().__init__(
+            n_envs,
+            observation_space,
+            action_space,
+            env,  # type: ignore[arg-type]  # None is fine where no hindsight goals are sampled
+            device=device,
+            n_envs=n_envs,
+            optimize_memory_usage=optimize_memory_usage,
+            handle_timeout_termination=handle_timeout_termination,
+            n_sampled_goal=n_sampled_goal,
+            goal_selection_strategy=goal_selection_strategy,
+            copy_info_dict=copy_info_dict,
+        )
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.storage_dtypes = storage_dtypes
+        self.memmap_dir = memmap_dir
+        self.player_keys = None if player_keys is None else tuple(player_keys)
+        self._allocate()
+
+    # ------------------------------------------------------------------ storage
+
+    def _allocate(self) -> None:
+        """Arrays for ``buffer_size`` transitions per environment, and empty books."""
+        shape = (self.buffer_size, self.n_envs)
+        assert isinstance(self.obs_shape, dict)
+        codecs = make_codecs(self.observation_space, self.obs_shape, self.storage_dtypes)
+        n_slots = self.buffer_size * self.n_envs
+        n_bytes = {key: codec.nbytes * n_slots for key, codec in codecs.items()}
+        in_files = 0 if self.memmap_dir is None else sum(n_bytes.values())
+        n_bytes["actions and books"] = (self.action_dim * self.actions.dtype.itemsize + _BOOKS) * n_slots
+        check_space(n_bytes, in_files, self.memmap_dir, f"{type(self).__name__} of {n_slots:,} transitions")
+
+        allocate = in_memory if self.memmap_dir is None else InFolder(self.memmap_dir)
+        self.ring = ObservationRing(self.buffer_size, self.n_envs, codecs, allocate)
+        self.actions = np.zeros((*shape, self.action_dim), dtype=self.actions.dtype)
+        # What is read together lies together: at a million transitions, most of the time of `sample` is waiting for memory
+        self._outcomes = np.zeros((*shape, 3), dtype=np.float32)
+        self._link_views()
+        self._current_ep_start = np.zeros(self.n_envs, dtype=np.int64)
+        self.infos = np.empty(shape if self.copy_info_dict else (0, self.n_envs), dtype=object)
+
+        self._episodes: list[deque[Episode]] = [deque() for _ in range(self.n_envs)]
+        # Environments whose oldest, second oldest, ... complete episode starts in a slot
+        self._starts: dict[int, list[int]] = {}
+        self._n_episodes = np.zeros(self.n_envs, dtype=np.int64)
+        # Complete episodes of an environment are contiguous in the ring and end where the current one starts, so their
+        # number of transitions says which slots can be sampled.
+        self._n_valid = np.zeros(self.n_envs, dtype=np.int64)
+        self._valid_ends = np.cumsum(self._n_valid)
+        self._n_steps = 0
+        self._began = np.zeros(self.n_envs, dtype=np.int64)  # number of the step that the unfinished episodes began with
+        self._earliest_began = 0
+
+    def _link_views(self) -> None:
+        """SB3's arrays, as views of where the numbers are."""
+        self.rewards, self.dones, self.timeouts = (self._outcomes[:, :, i] for i in range(3))
+        self.ep_start, self.ep_length = (self.ring.spans[:, :, i] for i in range(2))
+        self.observations = self.ring.observations
+        self.next_observations = {key: NextObservationView(self.ring, key) for key in self.observations}  # type: ignore[misc]
+
+    def reset(self) -> None:
+        """Forget all transitions and episodes."""
+        super().reset()
+        self._allocate()
+
+    @property
+    def n_added(self) -> int:
+        """Number of transitions that D has been given."""
+        return self._n_steps * self.n_envs
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that all arrays take (of which the system gives those in memory only as they are written to)."""
+        return self.ring.nbytes + self.actions.nbytes + self._outcomes.nbytes
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, np.ndarray],
+        next_obs: dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment.
+
+        :raises ValueError: if an episode does not fit into the buffer, for wrong shapes, rewards that are not finite, values
+            that compact storage cannot hold, a full disk; nothing is stored then
+        """
+        ring, pos, n_envs = self.ring, self.pos, self.n_envs
+        # whatever can fail comes before the first change
+        encoded_next = ring.encode(next_obs)
+        reward = checked_rewards(reward, n_envs)
+        action = np.reshape(action, (n_envs, self.action_dim))
+        ring.final.reserve(2 * n_envs)
+        encoded = None if ring.goes_on_with(obs) else ring.encode(obs)
+        if encoded is not None:
+            self._cut_discontinued_episodes(encoded)
+        if self._n_steps - self._earliest_began >= self.buffer_size:
+            self._refuse_long_episode()
+
+        if pos in self._starts:
+            self._make_room(pos)
+        ring.write(pos, encoded)
+        ring.write_next(pos, encoded_next, next_obs)
+        self.actions[pos] = action
+        self.rewards[pos] = reward
+        self.dones[pos] = done
+        self.ep_start[pos] = self._current_ep_start
+        if self.copy_info_dict:
+            self.infos[pos] = infos
+        self.timeouts[pos] = 0
+        self.pos = (pos + 1) % self.buffer_size
+        self.full = self.full or self.pos == 0
+        self._n_steps += 1
+        dones = done.tolist()
+        if True in dones:
+            for env_idx, ended in enumerate(dones):
+                if ended:
+                    if self.handle_timeout_termination:
+                        self.timeouts[pos, env_idx] = infos[env_idx].get("TimeLimit.truncated", False)
+                    self._compute_episode_length(env_idx)
+
+    def _cut_discontinued_episodes(self, encoded: dict[str, np.ndarray]) -> None:
+        """
+        An environment may be reset in the middle of an episode, as a second ``learn()`` does. Its last transition would
+        then be taken to lead to the first observation of the new episode, so the old one ends here, as a truncation.
+        """
+        for env_idx in np.flatnonzero(self._began < self._n_steps).tolist():
+            if not self.ring.continues(env_idx, encoded):
+                self._truncate_episode(env_idx)
+
+    def _refuse_long_episode(self) -> None:
+        env_idx = int(np.argmin(self._began))
+        raise ValueError(
+            f"Environment {env_idx}: an episode is longer than the {self.buffer_size} transitions that the buffer holds "
+            f"per environment. Set buffer_size to more than {self.n_envs} x the longest episode "
+            f"(currently {self.buffer_size * self.n_envs}), or limit the episodes (gymnasium.wrappers.TimeLimit)."
+        )
+
+    def _make_room(self, slot: int) -> None:
+        """Forget the episodes (and what refers to them) whose first slot is overwritten next."""
+        for env_idx in self._starts.pop(slot):
+            episode = self._episodes[env_idx].popleft()
+            assert episode.start == slot
+            slots = episode.slots(self.buffer_size)
+            self.ring.drop_episode(int(slots[-1]), env_idx)
+            # The parent's way to say "not to be sampled" (it reads this array in `_sample_goals`)
+            self.ep_length[slots, env_idx] = 0
+            self._n_valid[env_idx] -= episode.length
+            self._forget(episode)
+        self._valid_ends = np.cumsum(self._n_valid)
+
+    def _compute_episode_length(self, env_idx: int) -> None:
+        """Book an episode that ends with the newest transition."""
+        start, length = int(self._current_ep_start[env_idx]), self._n_steps - int(self._began[env_idx])
+        episode = Episode(env_idx, start, length, ordinal=int(self._n_episodes[env_idx]))
+        stop = start + length
+        self.ep_length[start : min(stop, self.buffer_size), env_idx] = length
+        self.ep_length[: max(stop - self.buffer_size, 0), env_idx] = length
+        self.ring.end_episode((stop - 1) % self.buffer_size, env_idx)
+        self._current_ep_start[env_idx] = self.pos
+        self._began[env_idx] = self._n_steps
+        self._earliest_began = int(self._began.min())
+        self._episodes[env_idx].append(episode)
+        self._starts.setdefault(start, []).append(env_idx)
+        self._n_episodes[env_idx] += 1
+        self._n_valid[env_idx] += length
+        self._valid_ends = np.cumsum(self._n_valid)
+        self._remember(episode)
+
+    def _truncate_episode(self, env_idx: int) -> None:
+        last = (self.pos - 1) % self.buffer_size
+        self.dones[last, env_idx] = True
+        self._compute_episode_length(env_idx)
+        if self.handle_timeout_termination:
+            self.timeouts[last, env_idx] = True  # not an actual timeout, but it allows bootstrapping
+
+    def _remember(self, episode: Episode) -> None:
+        """An episode is complete."""
+
+    def _forget(self, episode: Episode) -> None:
+        """An episode is about to be overwritten."""
+
+    # ------------------------------------------------------------------ sampling for P
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:  # type: ignore[override]
+        """
+        Transitions drawn uniformly from all complete episodes, a part of them with hindsight goals.
+
+        :param batch_size: number of transitions
+        :param env: associated VecEnv to normalize the observations and rewards
+        :return: samples; observations hold ``player_keys`` only
+        :raises RuntimeError: before the end of the first episode
+        """
+        self._check_can_sample()
+        return self._read(*self._uniform_transitions(batch_size), int(self.her_ratio * batch_size), env)
+
+    def _check_can_sample(self) -> None:
+        if not self.episodes_ended:
+            raise RuntimeError(
+                "Unable to sample before the end of the first episode: there is no complete one among the last "
+                f"{self.size() * self.n_envs} transitions. Set learning_starts to more than n_envs x the longest episode, "
+                "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit)."
+            )
+
+    def _uniform_transitions(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """:return: slots and environments of n transitions of complete episodes, with replacement, each shape ``(n,)``"""
+        if n == 0:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        ends = self._valid_ends
+        picks = np.random.randint(ends[-1], size=n)
+        if self.n_envs == 1:
+            envs = np.zeros(n, dtype=np.int64)
+            rows = picks + (self._current_ep_start[0] - ends[0])
+        else:
+            envs = ends.searchsorted(picks, side="right")
+            # oldest + (pick - ends of the environment before)
+            rows = picks + (self._current_ep_start - ends).take(envs)
+        rows[rows < 0] += self.buffer_size
+        return rows, envs
+
+    def _read(
+        self,
+        rows: np.ndarray,
+        envs: np.ndarray,
+        n_virtual: int = 0,
+        env: VecNormalize | None = None,
+        last_rewards: np.ndarray | None = None,
+        last_is_goal: np.ndarray | None = None,
+    ) -> DictReplayBufferSamples:
+        """
+        :param rows: slots of transitions, shape ``(n,)``
+        :param envs: their environments, shape ``(n,)``
+        :param n_virtual: the first so many get a hindsight goal
+        :param env: normalizes observations and rewards
+        :param last_rewards: rewards instead of the task's, for the last transitions
+        :param last_is_goal: which of these end here
+        """
+        wanted = self._keys_for_player()
+        at = self.ring.locate(rows, envs)
+        # VecNormalize wants all the keys that it normalizes, hindsight the goals, whether P reads them or not
+        keys = wanted if env is None and not n_virtual else tuple(self.observations)
+        obs: Any = {key: self.ring.read(key, at) for key in keys}
+        next_obs: Any = {key: self.ring.read_next(key, at) for key in keys}
+        outcomes = self._outcomes.reshape(-1, 3).take(at.here, axis=0)
+        rewards = outcomes[:, :1]
+        dones = outcomes[:, 1:2] * (1 - outcomes[:, 2:])
+        if n_virtual:
+            goals = self._hindsight_goals(at, n_virtual)
+            achieved = next_obs["achieved_goal"][:n_virtual]
+            rewards[:n_virtual, 0] = self._hindsight_rewards(rows[:n_virtual], envs[:n_virtual], achieved, goals)
+            for observations in (obs, next_obs):
+                observations["desired_goal"][:n_virtual] = goals
+        if last_rewards is not None:
+            rewards[len(rewards) - len(last_rewards) :, 0] = last_rewards
+        if last_is_goal is not None:
+            dones[len(dones) - len(last_is_goal) :, 0][last_is_goal] = 1
+        if env is not None:
+            obs, next_obs = env.normalize_obs(obs), env.normalize_obs(next_obs)
+            rewards = self._normalize_reward(rewards, env)
+        tensor = self._tensor
+        return DictReplayBufferSamples(
+            observations={key: tensor(obs[key]) for key in wanted},
+            actions=tensor(self.actions.reshape(-1, self.action_dim).take(at.here, axis=0)),
+            next_observations={key: tensor(next_obs[key]) for key in wanted},
+            dones=tensor(dones),
+            rewards=tensor(np.ascontiguousarray(rewards)),
+        )
+
+    def _tensor(self, fresh: np.ndarray) -> th.Tensor:
+        """On P's device, sharing the memory of an array that is nobody else's."""
+        tensor = th.from_numpy(fresh)
+        return tensor if self.device.type == "cpu" else tensor.to(self.device)
+
+    def _sample_goals(self, batch_indices: np.ndarray, env_indices: np.ndarray) -> np.ndarray:
+        """As the parent's."""
+        return self._hindsight_goals(self.ring.locate(batch_indices, env_indices), len(batch_indices))
+
+    def _hindsight_goals(self, at: Transitions, n: int) -> np.ndarray:
+        """
+        Goals for the first n transitions by ``goal_selection_strategy``. (NumPy's ``randint`` between arrays, which the parent
+        uses, takes longer than all the rest of ``sample``.)
+        """
+        at = at._replace(envs=at.envs[:n], starts=at.starts[:n], steps=at.steps[:n], lengths=at.lengths[:n])
+        if self.goal_selection_strategy == GoalSelectionStrategy.FINAL:
+            steps = at.lengths - 1
+        else:
+            # inclusive of the transition itself: what it leads to may be the goal
+            first: Any = at.steps if self.goal_selection_strategy == GoalSelectionStrategy.FUTURE else 0
+            steps = first + (np.random.random(n) * (at.lengths - first)).astype(np.int64)
+        return self.ring.read_next("achieved_goal", self.ring.locate_later(at, steps))
+
+    def _hindsight_rewards(self, rows: np.ndarray, envs: np.ndarray, achieved: np.ndarray, goals: np.ndarray) -> np.ndarray:
+        """The environment's rewards for what was achieved, had these been the goals, shape ``(n,)``."""
+        if self.env is None:
+            raise ValueError("Hindsight goals need the environment to compute their rewards: call set_env(env) first")
+        infos = copy.deepcopy(self.infos[rows, envs]) if self.copy_info_dict else [{}] * len(rows)
+        # all environments are taken to be alike, as the parent does
+        return np.asarray(
+            self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])[0], dtype=np.float32
+        ).reshape(-1)
+
+    def _get_real_samples(
+        self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        """As the parent's, without hindsight goals."""
+        return self._read(batch_indices, env_indices, 0, env)
+
+    def _get_virtual_samples(
+        self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        """As the parent's, with hindsight goals."""
+        return self._read(batch_indices, env_indices, len(batch_indices), env)
+
+    def _keys_for_player(self) -> tuple[str, ...]:
+        return tuple(self.observations) if self.player_keys is None else self.player_keys
+
+    # ------------------------------------------------------------------ sequences for C, episodes
+
+    def sample_sequences(self, batch_size: int, length: int, keys: Sequence[str] | None = None) -> SequenceBatch:
+        """
+        Sequences of consecutive states for the world model, starting anywhere, across episode boundaries.
+
+        Starts are uniform over the transitions that at least ``length - 1`` transitions of complete episodes follow in
+        the same environment. An environment with fewer gives what it has, padded and masked.
+
+        :param batch_size: number of sequences
+        :param length: rows per sequence
+        :param keys: observation keys; None: all
+        :return: time-major batch, see :class:`~sb3_cpm.type_aliases.SequenceBatch`
+        :raises RuntimeError: before the end of the first episode
+        """
+        if not self.episodes_ended:
+            raise RuntimeError(f"No complete episode to sample sequences from after {self.n_added} transitions")
+        envs, offsets = draw_starts(self._n_valid, batch_size, length)
+        n_valid = self._n_valid[envs]
+        oldest = self._current_ep_start[envs] - n_valid
+        return read_sequences(
+            self, oldest, n_valid, envs, offsets, length, tuple(self.observations) if keys is None else tuple(keys)
+        )
+
+    def episode_observations(self, episode: Episode, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """
+        :param episode: an episode that is still in D
+        :param keys: observation keys; None: all
+        :return: its states, one array of shape ``(length + 1, *observation_shape)`` per key
+        :raises ValueError: if D has overwritten it
+        """
+        self._check_present(episode)
+        slots = episode.slots(self.buffer_size)
+        at = self.ring.locate(slots, np.full(episode.length, episode.env_idx))
+        last = self.ring.locate(slots[-1:], np.array([episode.env_idx]))
+        return {
+            key: np.concatenate([self.ring.read(key, at), self.ring.read_next(key, last)])
+            for key in (self.observations if keys is None else keys)
+        }
+
+    def episode_actions(self, episode: Episode) -> np.ndarray:
+        """:return: executed actions of an episode that is still in D, within [-1, 1], shape ``(length, action_dim)``"""
+        self._check_present(episode)
+        return self.actions[episode.slots(self.buffer_size), episode.env_idx]
+
+    def _check_present(self, episode: Episode) -> None:
+        episodes = self._episodes[episode.env_idx]
+        if not episodes or not episodes[0].ordinal <= episode.ordinal <= episodes[-1].ordinal:
+            raise ValueError(
+                f"{episode} is no longer in the buffer, which holds {self.buffer_size} transitions per environment"
+            )
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """Complete episodes in D, by environment, oldest first."""
+        return [episode for episodes in self._episodes for episode in episodes]
+
+    @property
+    def episodes_ended(self) -> bool:
+        """Whether there is a complete episode to sample from."""
+        return bool(self._valid_ends[-1])
+
+    def _transition(self, row: int) -> tuple[Any, ...]:
+        """What was given to ``add()``."""
+        at = self.ring.locate(np.full(self.n_envs, row), np.arange(self.n_envs))
+        return (
+            {key: self.ring.read(key, at) for key in self.observations},
+            {key: self.ring.read_next(key, at) for key in self.observations},
+            self.actions[row],
+            self.rewards[row],
+            self.dones[row],
+            [{"TimeLimit.truncated": bool(timeout)} for timeout in self.timeouts[row]],
+        )
+
+    # ------------------------------------------------------------------ environment, saving, loading
+
+    def set_env(self, env: VecEnv) -> None:
+        """
+        Set the environment, after loading.
+
+        :param env: the training environment
+        :raises ValueError: if the buffer was filled in environments of another kind or number
+        """
+        check_environment(env, self.observation_space, self.action_space, self.n_envs)
+        super().set_env(env)
+
+    def truncate_last_trajectory(self) -> None:
+        """As the parent's, and also for an episode that fills the buffer exactly."""
+        if (self._began < self._n_steps).any() and (self._current_ep_start == self.pos).all():
+            for env_idx in np.flatnonzero(self._began < self._n_steps):
+                self._truncate_episode(int(env_idx))
+        super().truncate_last_trajectory()
+
+    def save(self, path: str | Path) -> None:
+        """
+        Save everything, as ``model.save_replay_buffer(path)`` does, but never leave half a file.
+
+        :param path: file to write, replaced only once it is complete
+        """
+        path = Path(path)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        try:
+            with temporary.open("wb") as file:
+                pickle.dump(self, file, protocol=pickle.HIGHEST_PROTOCOL)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:
+        """
+        Load what :meth:`save` or ``model.save_replay_buffer()`` saved.
+
+        :param path: the file
+        :param env: the training environment (for hindsight goals)
+        :raises ValueError: if it is truncated, foreign, or of a release that this one cannot read
+        """
+        with Path(path).open("rb") as file:
+            try:
+                buffer = pickle.load(file)
+            except Exception as error:  # a damaged pickle can raise nearly anything
+                raise unreadable(path, error) from error
+        if not isinstance(buffer, cls):
+            raise ValueError(f"{path} holds a {type(buffer).__name__}, not a {cls.__name__}")
+        if env is not None:
+            buffer.set_env(env)
+        return buffer
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        for name in _VIEWS:  # made anew
+            del state[name]
+        return {**state, "format": FORMAT}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        found = state.pop("format", None)
+        if found != FORMAT:
+            raise ValueError(
+                f"This replay buffer was saved in format {found}, this version of sb3_cpm reads format {FORMAT}: how "
+                "observations are laid out has changed. Collect it anew, or load it with the version that saved it."
+            )
+        super().__setstate__(state)
+        self._link_views()
