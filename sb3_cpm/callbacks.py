@@ -207,6 +207,7 @@ class ChallengerCallback(BaseCallback):
         self.stopwatch.stop("P acts")
         try:
             self._propose_challenges()
+            self._refresh_challenges()
             self._train_challenger()
         except BaseException:
             self._detach()
@@ -239,6 +240,20 @@ class ChallengerCallback(BaseCallback):
                 if proposal is not None:
                     self.proposals.append((episode, proposal))
                     self._log_proposal(proposal)
+
+    def _refresh_challenges(self) -> None:
+        """Beyond the report: what today's world model thinks of the challenges in I, every ``refresh_every`` transitions."""
+        assert self.challenger is not None
+        for challenge in self.buffer.due_for_refresh():
+            observations = self.buffer.episode_observations(challenge.episode, self.challenger.keys)
+            actions = self.buffer.episode_actions(challenge.episode)
+            with self.stopwatch.section("C evaluates"):
+                evaluation = self.challenger.evaluate(observations, actions)
+            change = self.buffer.refresh(challenge, evaluation)
+            self.logger.record_mean("challenge/refresh_change", change)
+        age = self.buffer.pop_sampled_age()
+        if age is not None:
+            self.logger.record_mean("challenge/sampled_age", age)
 
     def _train_challenger(self) -> None:
         """Line 21: train world model, ensemble, and C's actor and critic on D."""
