@@ -1,0 +1,300 @@
+"""
+The layer between ManiSkill's batched tensors and everybody else: N environments of one simulation as NumPy arrays.
+
+:class:`~sb3_cpm.envs.maniskill.ManiSkillEnv` is the case N = 1, :class:`~sb3_cpm.envs.vec_env.ManiSkillVecEnv` any N; both go
+through every line of this module, so what holds for one holds for the other.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_cpm.envs import clouds
+from sb3_cpm.envs import observations as obs_tools
+from sb3_cpm.envs.start_states import StartState, restore, state_of
+from sb3_cpm.envs.visuals import Visuals
+
+OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
+"""Our observation modes and ManiSkill's. "rgb+position+segmentation" costs the same one render as "rgb" alone."""
+
+
+class BatchStep(NamedTuple):
+    """
+    What happened in one step of N environments.
+
+    :param observations: one array per key, first axis N
+    :param rewards: shape ``(N,)``, float32
+    :param terminated: shape ``(N,)``, bool
+    :param truncated: shape ``(N,)``, bool
+    :param infos: Python numbers, one dict per environment
+    """
+
+    observations: dict[str, np.ndarray]
+    rewards: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    infos: list[dict[str, Any]]
+
+
+class ManiSkillBatch:
+    """
+    :param env: the unwrapped ManiSkill environment
+    :param cameras: names of the cameras to show, None for all that the task and the robot have
+    :param obs_mode: ``"visual"`` or ``"state"``
+    :param cloud: what the point cloud is to be
+    :param max_episode_steps: an episode is truncated after so many steps
+    :param ignore_terminations: see :func:`~sb3_cpm.envs.make_maniskill_env`
+    :param visuals: entered around whatever may build the scene
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        cameras: Sequence[str] | None,
+        obs_mode: str,
+        cloud: clouds.CloudSettings,
+        max_episode_steps: int,
+        ignore_terminations: bool,
+        visuals: Visuals,
+    ):
+        self.env: Any = env
+        self.num_envs: int = self.env.num_envs
+        self.obs_mode = obs_mode
+        self.cloud = cloud
+        self.max_episode_steps = max_episode_steps
+        self.ignore_terminations = ignore_terminations
+        self.episode_seeds = np.zeros(self.num_envs, dtype=np.int64)
+        self.state_layout: dict[str, slice] = {}
+        self._visuals = visuals
+        self._labels = np.zeros((self.num_envs, 1), dtype=np.int16)
+        self.cameras = self._choose_cameras(cameras) if obs_mode == "visual" else ()
+        self._scene_changed()
+        self.action_space: spaces.Box = self.env.single_action_space
+        # ManiSkill rendered once while it was built; that observation has every key, so the spaces need no second render
+        raw = obs_tools.to_host(self._select(self.env._last_obs))
+        self._last = self._observe(raw, np.arange(self.num_envs), np.zeros(self.num_envs, dtype=np.int64))
+        self.observation_space = _space(self._last)
+        self._grasps: dict[str, np.ndarray] = {}  # what the grippers feel, by the task's names
+
+    # ------------------------------------------------------------------ episodes
+    def reset(
+        self,
+        rows: np.ndarray,
+        seeds: Sequence[int],
+        states: Sequence[StartState | None] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+        """
+        Begin an episode in some of the environments; the others go on undisturbed.
+
+        With N = 1 the seed determines the start. With more, ManiSkill draws the starts of all that are reset together from one
+        generator, so a start depends on the seeds and on who else was reset: a run repeats, a single episode need not.
+
+        :param rows: indices of the environments, ascending, shape ``(n,)``
+        :param seeds: of their episodes, where no state is given
+        :param states: where to start instead, see :meth:`get_state`
+        :param options: passed to ManiSkill
+        :return: observations with first axis n, and n infos
+        """
+        states = [None] * len(rows) if states is None else states
+        self.episode_seeds[rows] = [s["seed"] if s is not None else seed for s, seed in zip(states, seeds, strict=True)]
+        everyone = len(rows) == self.num_envs
+        index = th.as_tensor(rows, device=self.env.device)
+        given = self.episode_seeds.copy()
+        if rows[0] != 0:
+            # ManiSkill seeds torch with the first entry. Were that the seed of environment 0, which is in the middle of its
+            # episode, then the others would start at the same place again and again until that episode ends.
+            given[0] = given[rows[0]]
+        with self._visuals:
+            raw, info = self.env.reset(
+                seed=given.tolist(), options={**(options or {}), **({} if everyone else {"env_idx": index})}
+            )
+        if info.pop("reconfigure", False):
+            self._scene_changed()
+        starts = {int(row): state for row, state in zip(rows, states, strict=True) if state is not None}
+        if starts:
+            restore(self.env, starts)
+            info = self.env.get_info()
+            raw = self.env._last_obs = self.env.get_obs(info)
+        host = obs_tools.to_host(self._select(raw, info), None if everyone else index)
+        # A new episode starts before any contact; ManiSkill still reports the contact of the last step that it simulated.
+        for part in (host["extra"], host["info"]):
+            for key in filter(_is_grasp, part):
+                part[key][:] = [bool(state and state["grasps"].get(key)) for state in states]
+        self._remember_grasps(host, rows)
+        observations = self._observe(host, rows, host["info"]["elapsed_steps"])
+        for key, value in observations.items():
+            self._last[key][rows] = value
+        return observations, self._infos(host["info"], len(rows))
+
+    def step(self, actions: np.ndarray) -> BatchStep:
+        """
+        :param actions: shape ``(N, action_dim)``
+        :raises ValueError: for actions that are not finite: they would ruin the simulation for good
+        """
+        actions = np.asarray(actions, dtype=np.float32)
+        if not np.isfinite(actions).all():
+            raise ValueError(f"Actions must be finite numbers within [-1, 1], got {actions}.")
+        raw, reward, terminated, _, info = self.env.step(actions)
+        host = obs_tools.to_host({**self._select(raw, info), "reward": reward, "terminated": terminated})
+        steps = host["info"]["elapsed_steps"]
+        rewards = host["reward"].astype(np.float32)
+        observations = self._observe(host, np.arange(self.num_envs), steps)
+        over = host["terminated"].astype(bool) & (not self.ignore_terminations)
+        truncated = steps >= self.max_episode_steps
+        infos = self._infos(host["info"], self.num_envs)
+        self._remember_grasps(host, np.arange(self.num_envs))
+        sane = np.isfinite(rewards) & np.isfinite(observations["state"]).all(axis=1)
+        if not sane.all():
+            for i in np.flatnonzero(~sane).tolist():
+                self._diverged(i, observations, infos[i], int(steps[i]))
+            rewards[~sane], over[~sane], truncated[~sane] = 0, False, True
+        self._last = observations
+        return BatchStep(observations, rewards, over, truncated, infos)
+
+    def _diverged(self, i: int, observations: dict[str, np.ndarray], info: dict[str, Any], step: int) -> None:
+        warnings.warn(
+            f"The simulation of {self.env_id} gave numbers that are not finite in step {step} of the episode with seed "
+            f"{self.episode_seeds[i]}: the episode is truncated there, its last observation is the one before, reward 0."
+        )
+        for key, value in observations.items():
+            value[i] = self._last[key][i]
+        info["diverged"] = True
+
+    def get_state(self, i: int) -> StartState:
+        """
+        :param i: index of the environment
+        :return: everything from which the simulation can go on here or elsewhere, see :mod:`sb3_cpm.envs.start_states`
+        """
+        grasps = {key: bool(values[i]) for key, values in self._grasps.items()}
+        return state_of(self.env, i, self.env_id, int(self.episode_seeds[i]), grasps)
+
+    def _remember_grasps(self, host: dict[str, Any], rows: np.ndarray) -> None:
+        for part in (host["extra"], host["info"]):
+            for key in filter(_is_grasp, part):
+                self._grasps.setdefault(key, np.zeros(self.num_envs, dtype=bool))[rows] = part[key]
+
+    @property
+    def env_id(self) -> str:
+        return self.env.spec.id if self.env.spec is not None else type(self.env).__name__
+
+    # ------------------------------------------------------------------ observation
+    def _select(self, raw: dict[str, Any], info: dict[str, Any] | None = None) -> dict[str, Any]:
+        """What is to be copied to the host, and nothing else."""
+        tree: dict[str, Any] = {"agent": raw["agent"], "extra": raw["extra"]}
+        if info is not None:
+            tree["info"] = {key: value for key, value in info.items() if isinstance(value, (th.Tensor, np.ndarray))}
+        for name in self.cameras:
+            sensor = raw["sensor_data"][name]
+            if self.cloud.n_points:
+                tree[f"camera {name}"] = {
+                    "rgb": sensor["rgb"],
+                    "position": sensor["position"],
+                    "segmentation": sensor["segmentation"],
+                    "cam2world": raw["sensor_param"][name]["cam2world_gl"],
+                }
+            else:
+                tree[f"camera {name}"] = {"rgb": sensor["rgb"]}
+        if self.cameras and self.cloud.n_points:
+            robot = self.env.agent
+            if self.cloud.frame == "base":
+                tree["frame"] = robot.robot.pose.raw_pose
+            elif self.cloud.frame == "end_effector":
+                tree["frame"] = robot.tcp.pose.raw_pose
+        return tree
+
+    def _observe(self, host: dict[str, Any], rows: np.ndarray, steps: np.ndarray) -> dict[str, np.ndarray]:
+        agent, extra = host["agent"], host["extra"]
+        observations: dict[str, np.ndarray] = {}
+        # copies: the pictures are parts of a block in which there is much else
+        for name in self.cameras:
+            observations[name] = host[f"camera {name}"]["rgb"].copy()
+        if self.cameras and self.cloud.n_points:
+            observations["pointcloud"] = clouds.make_clouds(
+                self.cloud,
+                [clouds.Picture(**host[f"camera {name}"]) for name in self.cameras],
+                self._labels[rows],
+                obs_tools.find_goal(extra),
+                extra["tcp_pose"][:, :3] if "tcp_pose" in extra else np.zeros((len(rows), 3)),
+                host.get("frame"),
+                # the same points of the same picture, wherever and whenever it is seen
+                lambda i: np.random.default_rng([int(self.episode_seeds[rows[i]]), int(steps[i])]),
+            )
+        parts = obs_tools.state_parts(agent, extra, privileged=self.obs_mode == "state")
+        if not self.state_layout:
+            self.state_layout = obs_tools.layout(parts)
+        observations["state"] = obs_tools.join_parts(parts, len(rows))
+        return observations
+
+    def _infos(self, info: Mapping[str, np.ndarray], n: int) -> list[dict[str, Any]]:
+        """Python numbers; arrays only where a task reports more than one number."""
+        names = list(info)
+        columns = [list(_rows(info[name], n)) for name in names]
+        infos = [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
+        for one in infos:
+            if "success" in one:
+                one["success"] = one["is_success"] = bool(one["success"])
+        return infos
+
+    # ------------------------------------------------------------------ scene
+    def _choose_cameras(self, wanted: Sequence[str] | None) -> tuple[str, ...]:
+        available = tuple(self.env._sensors)
+        unknown = [name for name in wanted or () if name not in available]
+        if unknown:
+            raise ValueError(f"Unknown camera {unknown[0]!r}: this task with this robot has {', '.join(available) or 'none'}.")
+        if self.cloud.n_points and self.cloud.frame == "end_effector" and not hasattr(self.env.agent, "tcp"):
+            raise ValueError(f"point_frame='end_effector': robot {self.env.agent.uid!r} names no end effector; take 'base'.")
+        return available if wanted is None else tuple(wanted)
+
+    def _scene_changed(self) -> None:
+        """After ManiSkill built the scene: ids are new, cameras nobody wants must not be rendered."""
+        if self.obs_mode == "visual":
+            self._labels = clouds.label_table(_things(self.env))
+        for name in set(self.env._sensors) - set(self.cameras):
+            del self.env._sensors[name]
+
+
+def _things(env: Any) -> list[dict[int, tuple[str, bool]]]:
+    """For each environment: segmentation id to the name of the thing and whether it is part of a robot."""
+    things: list[dict[int, tuple[str, bool]]] = [{} for _ in range(env.num_envs)]
+    agents = getattr(env.agent, "agents", [env.agent])
+    robots = {id(agent.robot) for agent in agents if agent is not None}
+    scene = env.scene
+    named = [(actor, actor._objs, False) for actor in scene.actors.values()]
+    for articulation in scene.articulations.values():
+        is_robot = id(articulation) in robots
+        named += [(link, [part.entity for part in link._objs], is_robot) for link in articulation.links]
+    for thing, entities, is_robot in named:
+        numbers = thing._scene_idxs.tolist()  # a thing may be in some of the environments only
+        for number, entity in zip(numbers, entities, strict=True):
+            things[number][entity.per_scene_id] = (thing.name, is_robot)
+    return things
+
+
+def _is_grasp(key: str) -> bool:
+    return "grasp" in key
+
+
+def _rows(values: np.ndarray, n: int) -> Iterator[Any]:
+    """One Python number (or array) per environment; what does not belong to one environment is everybody's."""
+    if values.ndim == 0 or len(values) != n:
+        return iter([values.item() if values.ndim == 0 else values] * n)
+    if values.size == n:
+        return iter(values.reshape(n).tolist())
+    return iter(value.copy() for value in values)
+
+
+def _space(example: Mapping[str, np.ndarray]) -> spaces.Dict:
+    return spaces.Dict(
+        {
+            key: spaces.Box(0, 255, value.shape[1:], np.uint8)
+            if value.dtype == np.uint8
+            else spaces.Box(-np.inf, np.inf, value.shape[1:], np.float32)
+            for key, value in example.items()
+        }
+    )
