@@ -38,7 +38,8 @@ class Challenger:
     :param device: "auto" takes the GPU where there is one
     :param preset: "default", "report", or a dict of entries, see :mod:`sb3_cpm.presets`
     :param keys: the observation keys to read; all images and vectors by default
-    :param uncertainty_class: "plan2explore" or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
+    :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
+        :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
     :param uncertainty_kwargs: arguments for it, on top of the preset's
     :param overrides: single preset entries
     :raises ValueError: for spaces it cannot work with and unknown preset entries
@@ -194,7 +195,7 @@ class Challenger:
         :return: batch dimensions ``(L - 1, n)``
         """
         expectation = self.world_model.latent.mean(posterior.stats[1:])  # less noisy a target than the sample
-        return Transitions(posterior.feat[:-1], actions[1:], expectation, posterior.deter[1:], embed[1:])
+        return Transitions(posterior.feat[:-1], actions[1:], expectation, posterior.deter[1:], embed[1:], embed[:-1])
 
     # ---- learning ----------------------------------------------------------------------------------------------------
 
@@ -246,7 +247,7 @@ class Challenger:
         transitions = self._transitions(output.posterior, batch.actions, output.embed)
         # neither into padding nor from the last state of one episode to the first of the next
         valid = batch.mask[1:] & batch.mask[:-1] & ~batch.is_first[1:]
-        transitions = Transitions(*(part[valid] for part in transitions if part is not None))
+        transitions = transitions.select(valid)
         if not len(transitions.feat):
             return {}
         loss = self.uncertainty.loss(transitions)

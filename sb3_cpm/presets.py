@@ -62,7 +62,12 @@ REPORT: dict[str, Any] = {
     "slow_target_every": 100,  # updates between two copies
     "train_task_behavior": False,  # also train an actor-critic for the task; the challenger does not act with it
     # constructor arguments of uncertainty classes, by name; `uncertainty_kwargs` come on top
-    "uncertainty": {"plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "feat", "metric": "exp"}},
+    "uncertainty": {
+        "plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "feat", "metric": "exp"},
+        "rnd": {"layers": 3, "units": 400, "output_dim": 64},
+        "prediction_error": {"layers": 2, "units": 400},
+        "observation_ensemble": {"heads": 10, "layers": 2, "units": 400},
+    },
 }
 
 DEFAULT: dict[str, Any] = {
@@ -84,7 +89,12 @@ DEFAULT: dict[str, Any] = {
     "actor_units": 128,
     "critic_layers": 2,
     "critic_units": 128,
-    "uncertainty": {"plan2explore": {"heads": 5, "layers": 2, "units": 128, "target": "feat", "metric": "exp"}},
+    "uncertainty": {
+        "plan2explore": {"heads": 5, "layers": 2, "units": 128, "target": "feat", "metric": "exp"},
+        "rnd": {"layers": 3, "units": 128, "output_dim": 64},
+        "prediction_error": {"layers": 2, "units": 128},
+        "observation_ensemble": {"heads": 5, "layers": 2, "units": 128},
+    },
 }
 
 PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}

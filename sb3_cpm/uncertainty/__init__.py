@@ -1,8 +1,35 @@
-"""Who says "this is new": novelty of transitions behind one seam (:class:`~sb3_cpm.uncertainty.base.Uncertainty`)."""
+"""
+Who says "this is new": novelty of transitions behind one seam (:class:`~sb3_cpm.uncertainty.base.Uncertainty`).
+
+===================== ============================================= ======================== ===========================
+name                  new is                                        on noise that stays      in imagination
+===================== ============================================= ======================== ===========================
+plan2explore          where predictors of the next latent disagree  calm                     the same as on real data
+observation_ensemble  the same for embeddings, without memory       calm                     from the dreamt embedding
+rnd                   a state unlike those seen so far              as new as its states     of the imagined next latent
+prediction_error      what was predicted badly                      high for ever            against the dreamt outcome
+===================== ============================================= ======================== ===========================
+"""
 
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty
+from sb3_cpm.uncertainty.observation_ensemble import ObservationEnsemble
 from sb3_cpm.uncertainty.plan2explore import Plan2Explore
+from sb3_cpm.uncertainty.prediction_error import PredictionError
+from sb3_cpm.uncertainty.rnd import RandomNetworkDistillation
 
-UNCERTAINTY_CLASSES: dict[str, type[Uncertainty]] = {"plan2explore": Plan2Explore}
+UNCERTAINTY_CLASSES: dict[str, type[Uncertainty]] = {
+    "plan2explore": Plan2Explore,
+    "rnd": RandomNetworkDistillation,
+    "prediction_error": PredictionError,
+    "observation_ensemble": ObservationEnsemble,
+}
 
-__all__ = ["UNCERTAINTY_CLASSES", "Plan2Explore", "Transitions", "Uncertainty"]
+__all__ = [
+    "UNCERTAINTY_CLASSES",
+    "ObservationEnsemble",
+    "Plan2Explore",
+    "PredictionError",
+    "RandomNetworkDistillation",
+    "Transitions",
+    "Uncertainty",
+]

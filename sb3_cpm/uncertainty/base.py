@@ -2,9 +2,8 @@
 The seam for novelty measures (report, section 4.4.1: DISAG in u_t; also the reward of C's exploration actor).
 
 A measure sees transitions between latent states. It may learn from real ones (:meth:`Uncertainty.loss`), must rate real and
-imagined ones (:meth:`Uncertainty.novelty`), and may adjust its scale to what it sees (:meth:`Uncertainty.adapt`). Random
-network distillation would rate ``next_stoch`` and ``next_deter`` and ignore the rest; a prediction error needs ``next_embed``
-and therefore falls back on the latents in imagination, where nothing was observed.
+imagined ones (:meth:`Uncertainty.novelty`), and may adjust its scale to what it sees (:meth:`Uncertainty.adapt`). In
+imagination nothing was observed, so there are no embeddings; every measure says in its docstring what it rates there instead.
 """
 
 from abc import ABC, abstractmethod
@@ -25,6 +24,7 @@ class Transitions(NamedTuple):
     :param next_stoch: stochastic part of state t+1, its expectation (a sample in imagination), ``(*batch, stoch_size)``
     :param next_deter: deterministic part of state t+1, shape ``(*batch, deter_size)``
     :param next_embed: encoder output of state t+1, shape ``(*batch, embed_dim)``; None in imagination
+    :param embed: encoder output of state t, shape ``(*batch, embed_dim)``; None in imagination
     """
 
     feat: torch.Tensor
@@ -32,6 +32,16 @@ class Transitions(NamedTuple):
     next_stoch: torch.Tensor
     next_deter: torch.Tensor
     next_embed: torch.Tensor | None = None
+    embed: torch.Tensor | None = None
+
+    @property
+    def next_feat(self) -> torch.Tensor:
+        """Whole latent of state t+1, shape ``(*batch, feat_dim)``."""
+        return torch.cat((self.next_stoch, self.next_deter), dim=-1)
+
+    def select(self, index: torch.Tensor) -> "Transitions":
+        """Those that an index or a mask picks."""
+        return Transitions(*(None if part is None else part[index] for part in self))  # type: ignore[arg-type]
 
 
 class LatentSizes(NamedTuple):
@@ -60,8 +70,8 @@ class Uncertainty(nn.Module, ABC):
     @abstractmethod
     def novelty(self, transitions: Transitions) -> torch.Tensor:
         """
-        How new each transition is, differentiable with respect to ``feat`` and ``action``: the exploration actor climbs
-        along this gradient.
+        How new each transition is, differentiable with respect to all that it reads of a transition: the exploration actor
+        climbs along this gradient, through the action and through the imagined states.
 
         :param transitions: real or imagined
         :return: shape ``(*batch,)``
