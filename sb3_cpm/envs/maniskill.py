@@ -16,8 +16,7 @@ from gymnasium.utils import seeding
 
 from sb3_cpm.envs.batch import OBS_MODES, ManiSkillBatch
 from sb3_cpm.envs.clouds import CloudSettings
-from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, explained
-from sb3_cpm.envs.rendering import ensure_renderer
+from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, choose_renderer, explained
 from sb3_cpm.envs.simulation import choose_simulation
 from sb3_cpm.envs.start_states import StartState, check_state
 from sb3_cpm.envs.visuals import choose_visuals
@@ -248,19 +247,19 @@ def build_batch(
         raise ValueError(f"Unknown obs_mode {obs_mode!r}, expected one of {', '.join(OBS_MODES)}.")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
-    renderer = ensure_renderer()
+    renderer = choose_renderer(env_id, obs_mode)
     task = check_task(env_id, robot_uids, control_mode, reward_mode, max_episode_steps)
     sim_backend, simulation_kwargs = choose_simulation(num_envs, sim_backend, task_kwargs)
     context = choose_visuals(visuals, software=renderer.software)
     with explained(env_id), context:
         env = gym.make(
-            env_id,
+            task.env_id,
             disable_env_checker=True,
             num_envs=num_envs,
             obs_mode=OBS_MODES[obs_mode],
             control_mode=control_mode,
             reward_mode=reward_mode,
-            render_mode=render_mode,
+            render_mode=render_mode if renderer.backend != "none" else None,
             sensor_configs={"height": height, "width": width},
             human_render_camera_configs={"height": render_size, "width": render_size},
             sim_backend=sim_backend,

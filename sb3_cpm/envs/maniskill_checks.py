@@ -9,8 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_cpm.envs.rendering import Renderer, ensure_renderer, without_renderer
+from sb3_cpm.envs.tasks import register_tasks, registered_name
+
 DEFAULT_ROBOT = "panda_wristcam"
 """The Panda with a camera at its hand, the report's robot."""
+
+NEEDS_PICTURES = ("OpenCabinetDrawer-v1", "OpenCabinetDoor-v1")
+"""Tasks that read where something is from the shapes that are drawn, here the handles: they need a renderer in any mode."""
 
 ASSET_FILES = {"ycb": "info_pick_v0.json"}
 """A file that a complete download has: ManiSkill itself only asks for the folder, which a failed download leaves behind."""
@@ -20,11 +26,13 @@ class Task(NamedTuple):
     """
     A task that can be built.
 
+    :param env_id: name under which ManiSkill has it with the reward that is wanted
     :param robot: ManiSkill's name of the robot, None if the task chooses one that we cannot know
     :param robot_kwargs: what to tell the task about its robot
     :param max_episode_steps: steps until truncation
     """
 
+    env_id: str
     robot: str | None
     robot_kwargs: dict[str, Any]
     max_episode_steps: int
@@ -57,6 +65,25 @@ def check_sizes(
     return size[0], size[1]
 
 
+def choose_renderer(env_id: str, obs_mode: str) -> Renderer:
+    """
+    :param env_id: name of the task
+    :param obs_mode: ``"state"`` needs no pictures, so it works without a Vulkan driver
+    :return: the renderer of this process, with the backend ``"none"`` if there is none and none is needed
+    :raises RuntimeError: if a renderer is needed and this machine has none, with the cure
+    """
+    try:
+        return ensure_renderer()
+    except RuntimeError as error:
+        if obs_mode != "state":
+            raise
+        if env_id in NEEDS_PICTURES:
+            raise RuntimeError(
+                f"{env_id} needs a renderer even with obs_mode='state': it finds the handles by their looks. {error}"
+            ) from error
+        return without_renderer()
+
+
 def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: str, max_episode_steps: int | None) -> Task:
     """
     :param env_id: name of the task
@@ -70,6 +97,8 @@ def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: s
     from mani_skill.agents.registration import REGISTERED_AGENTS
     from mani_skill.utils.registration import REGISTERED_ENVS
 
+    register_tasks()
+    env_id = registered_name(env_id, reward_mode)
     if env_id not in REGISTERED_ENVS:
         raise ValueError(f"Unknown task {env_id!r}. {_nearest(env_id, REGISTERED_ENVS)}")
     spec = REGISTERED_ENVS[env_id]
@@ -86,7 +115,7 @@ def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: s
     known = {name for robots in spec.cls.SUPPORTED_ROBOTS or () for name in ([robots] if isinstance(robots, str) else robots)}
     if robot is None and known & {"panda", DEFAULT_ROBOT}:
         robot = DEFAULT_ROBOT
-    task = Task(robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
+    task = Task(env_id, robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
     if task.robot in REGISTERED_AGENTS:
         _check_robot(REGISTERED_AGENTS[task.robot].agent_cls, control_mode)
     return task

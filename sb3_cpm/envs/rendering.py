@@ -9,6 +9,8 @@ through.
 """
 
 import contextlib
+import functools
+import importlib
 import importlib.util
 import json
 import os
@@ -19,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +38,7 @@ class Renderer(NamedTuple):
     """
     A renderer that works.
 
-    :param backend: what ManiSkill calls it: ``"gpu"`` or ``"cpu"``
+    :param backend: what ManiSkill calls it: ``"gpu"`` or ``"cpu"``, ``"none"`` for :func:`without_renderer`
     :param name: name of the Vulkan device
     :param software: whether the CPU draws, which makes triangles dear
     """
@@ -87,6 +90,39 @@ def ensure_renderer() -> Renderer:
         if _renderer.software:
             use_fast_shaders()
     return _renderer
+
+
+class _NoMaterial:
+    """Stands in for SAPIEN's material of something that nobody will draw: takes any argument and any attribute."""
+
+    def __init__(self, *args: Any, **attributes: Any) -> None:
+        vars(self).update(attributes)
+
+
+def without_renderer() -> Renderer:
+    """
+    Let this process build scenes without a Vulkan device, for observations without pictures.
+
+    Even then ManiSkill describes materials, and SAPIEN's material needs a device. From here on, in this process, materials are
+    of a class of ours that needs none; the physics never look at them. Only call this where :func:`ensure_renderer` failed.
+
+    :return: a renderer that draws nothing
+    """
+    import sapien
+
+    importlib.import_module("mani_skill.envs")  # whose modules hold these classes by name
+    _say_that_nothing_is_drawn()
+    for name in ("RenderMaterial", "RenderTexture2D"):
+        original = getattr(sapien.render, name)
+        for module in list(sys.modules.values()):
+            if getattr(module, "__dict__", {}).get(name) is original:
+                setattr(module, name, _NoMaterial)
+    return Renderer("none", "", software=False)
+
+
+@functools.cache
+def _say_that_nothing_is_drawn() -> None:
+    warnings.warn(f"No renderer: states are simulated as ever, env.render() gives None. {cure()}.", stacklevel=5)
 
 
 def cure() -> str:

@@ -2,45 +2,32 @@
 Light visuals: what a software renderer can draw fast.
 
 On a CPU, ManiSkill's pictures are slow because of triangles, not pixels: the Panda's hand camera alone has 425,160 of
-them, its links 135,000, the floor 20,000. Light visuals replace the robot's *visual* meshes by decimated ones with the same
-colours and the floor by two triangles. Collision shapes, masses, joints and the floor's collision plane stay, so the
-physics stay the same to the last bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
-
-Decimated robots are kept in the cache folder (:func:`sb3_cpm.envs.vulkan.cache_folder`); making one takes about two seconds.
+them, its links 135,000, the floor 20,000. Light visuals draw coarser meshes of the same colours
+(:mod:`sb3_cpm.envs.meshes`), of the robot as of everything else that comes from a file, and a floor of two triangles.
+Collision shapes, masses, joints and the floor's collision plane are untouched, so the physics stay the same to the last bit. The
+pictures look alike but are not equal: train and evaluate with the same visuals.
 """
 
 import contextlib
-import hashlib
 import importlib
+import importlib.util
 import inspect
-import shutil
 import sys
-import tempfile
 import warnings
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sb3_cpm.envs import vulkan
-from sb3_cpm.envs.rendering import publish
+from sb3_cpm.envs.meshes import light_shapes
 
 VISUALS = ("auto", "light", "full")
-FORMAT = 1
-"""Part of the cache key: raise it when the generated files change."""
 
-SHARE = 0.05
-"""Share of the triangles that stays, within the two limits below; at 32 to 128 pixels nobody sees the others."""
-FEWEST, MOST = 64, 1500
-"""Triangles of one colour of one link."""
+PACKAGES = ("trimesh", "fast_simplification")
+"""What making light meshes takes."""
 
-SMALL = 0.15
-"""Metres; a part of at most this size may be drawn as its convex hull."""
-
-FORMATS = (".glb", ".gltf", ".stl", ".obj", ".ply")
-"""Mesh files that are decimated; others (Collada) stay as they are."""
+MEASURED = "handle"
+"""Part of the names of shapes that stay: the cabinet tasks measure where a handle is by what it looks like."""
 
 
 class Visuals(contextlib.AbstractContextManager[None]):
@@ -48,130 +35,80 @@ class Visuals(contextlib.AbstractContextManager[None]):
     Within this context ManiSkill builds scenes with light visuals; afterwards everything is as before. Enter it as often as a
     scene may be built: on ``gym.make`` and, since some tasks build a new scene for every episode, on ``reset``.
 
-    :param urdf: the light robot, None to leave the robot as it is
-    :param agent_class: ManiSkill's class of the robot
-    :param light_ground: whether the floor is replaced
+    :param light: False for a context that does nothing
+    :param meshes: False to make only the floor light
     """
 
-    def __init__(self, urdf: Path | None = None, agent_class: Any = None, light_ground: bool = False):
-        self.urdf = urdf
-        self.agent_class = agent_class
-        self.light_ground = light_ground
+    def __init__(self, light: bool = False, meshes: bool = True):
+        self.light = light
+        self.meshes = meshes
         self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> None:
-        if self.urdf is not None:
-            # the class attribute, not a robot of our own: tasks place a robot by its name
-            _swap(self._undo, self.agent_class, "urdf_path", str(self.urdf))
-        if self.light_ground:
-            original: Any = importlib.import_module("mani_skill.utils.building.ground").build_ground
-            light = _light_ground(original)
-            # modules hold the function under its name; a task of the user's own may do the same
-            for module in list(sys.modules.values()):
-                if getattr(module, "__dict__", {}).get("build_ground") is original:
-                    _swap(self._undo, module, "build_ground", light)
+        if not self.light:
+            return
+        if self.meshes:
+            builder: Any = importlib.import_module("sapien.wrapper.actor_builder").ActorBuilder
+            _swap(self._undo, builder, "build_render_component", _light_component(builder.build_render_component))
+        original: Any = importlib.import_module("mani_skill.utils.building.ground").build_ground
+        light = _light_ground(original)
+        # modules hold the function under its name; a task of the user's own may do the same
+        for module in list(sys.modules.values()):
+            if getattr(module, "__dict__", {}).get("build_ground") is original:
+                _swap(self._undo, module, "build_ground", light)
 
     def __exit__(self, *exception: object) -> None:
         self._undo.close()
 
 
-def choose_visuals(visuals: str, software: bool, robot: str | None) -> Visuals:
+def choose_visuals(visuals: str, software: bool) -> Visuals:
     """
     :param visuals: ``"light"``, ``"full"`` or ``"auto"``: light on a software renderer
     :param software: whether the renderer is one
-    :param robot: ManiSkill's name of the robot, None if unknown (then only the floor is made light)
     :raises ValueError: for an unknown choice
+    :raises RuntimeError: for ``"light"`` without the packages that it takes
     """
     if visuals not in VISUALS:
         raise ValueError(f"visuals must be one of {', '.join(VISUALS)}, got {visuals!r}.")
     if visuals == "full" or (visuals == "auto" and not software):
         return Visuals()
-    from mani_skill import format_path
-    from mani_skill.agents.registration import REGISTERED_AGENTS
-
-    agent_class = REGISTERED_AGENTS[robot].agent_cls if robot in REGISTERED_AGENTS else None
-    if agent_class is None or not agent_class.urdf_path:
-        return Visuals(light_ground=True)  # robots described in MJCF are few and simple
-    try:
-        return Visuals(light_robot(Path(format_path(str(agent_class.urdf_path)))), agent_class, light_ground=True)
-    except ImportError as error:
-        if visuals == "light":
-            raise RuntimeError(f"visuals='light' needs {error.name}: pip install trimesh fast-simplification") from error
-        warnings.warn(f"Slow rendering, {error.name} is missing: pip install trimesh fast-simplification", stacklevel=2)
-        return Visuals(light_ground=True)
+    missing = [package for package in PACKAGES if importlib.util.find_spec(package) is None]
+    if missing and visuals == "light":
+        raise RuntimeError(f"visuals='light' needs {missing[0]}: pip install trimesh fast-simplification")
+    if missing:
+        warnings.warn(f"Slow rendering, {missing[0]} is missing: pip install trimesh fast-simplification", stacklevel=2)
+    return Visuals(light=True, meshes=not missing)
 
 
-# ---------------------------------------------------------------------- robot
-def light_robot(urdf: Path) -> Path:
+# ---------------------------------------------------------------------- meshes
+def _light_component(original: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """
-    A copy of a robot description with decimated visual meshes.
-
-    :param urdf: the robot as ManiSkill ships it
-    :return: the light one, in the cache folder; made if it is not there yet
+    :param original: SAPIEN's method that makes what is drawn of a body, from the builder's list of shapes
     """
-    tree = ElementTree.parse(urdf)
-    key = hashlib.sha256(f"{FORMAT} {SHARE} {FEWEST} {MOST} {SMALL} {urdf.resolve()}".encode() + urdf.read_bytes())
-    for mesh in tree.iter("mesh"):
-        path = urdf.parent / mesh.attrib["filename"]
-        key.update(f"{path} {path.stat().st_size if path.exists() else None}".encode())
-    target = vulkan.cache_folder() / f"robot-{urdf.stem}-{key.hexdigest()[:16]}"
-    if not target.exists():
-        with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
-            folder = Path(temporary, "robot")
-            folder.mkdir()
-            visual = {mesh for element in tree.iter("visual") for mesh in element.iter("mesh")}
-            for mesh in list(tree.iter("mesh")):
-                original = urdf.parent / mesh.attrib["filename"]
-                # the folder moves to `target` when it is complete
-                light = _light_mesh(original, folder) if mesh in visual else None
-                mesh.set("filename", str(original.resolve() if light is None else target / light))
-            tree.write(folder / urdf.name)
-            # which links may touch each other is told by the file beside the robot: without it the physics change
-            if urdf.with_suffix(".srdf").exists():
-                shutil.copy(urdf.with_suffix(".srdf"), folder)
-            publish(folder, target)
-    return target / urdf.name
+
+    def build_render_component(builder: Any) -> Any:
+        shapes: list[Any] = []
+        rest = []
+        for record in builder.visual_records:
+            light = light_shapes(record) if record.type == "file" and _may_change(record) else []
+            shapes += light
+            rest += [] if light else [record]
+        records, builder.visual_records = builder.visual_records, rest
+        try:
+            component = original(builder)
+        finally:
+            builder.visual_records = records
+        for shape in shapes:
+            component.attach(shape)
+        return component
+
+    return build_render_component
 
 
-def _light_mesh(original: Path, folder: Path) -> str | None:
-    """:return: name of the decimated file within ``folder``, None to use the original"""
-    if original.suffix.lower() not in FORMATS or not original.exists():
-        return None
-    import fast_simplification  # noqa: F401  (trimesh needs it, and says so too late)
-    import trimesh
-
-    name = f"{hashlib.sha256(str(original).encode()).hexdigest()[:8]}-{original.name}"
-    if (folder / name).exists():
-        return name
-    loaded = trimesh.load(original)
-    try:
-        if isinstance(loaded, trimesh.Scene):
-            for key, part in loaded.geometry.items():
-                loaded.geometry[key] = _decimate(part)
-        else:
-            loaded = _decimate(loaded)
-        loaded.export(folder / name)
-    except (ValueError, AttributeError):  # points, lines, an empty mesh
-        return None
-    return name
-
-
-def _decimate(mesh: Any) -> Any:
-    """Fewer triangles, the same material. A textured mesh stays: its texture coordinates would be lost."""
-    import trimesh
-
-    wanted = int(min(MOST, max(FEWEST, SHARE * len(mesh.faces))))
-    material = getattr(mesh.visual, "material", None)
-    if len(mesh.faces) <= wanted or getattr(mesh.visual, "uv", None) is not None:
-        return mesh
-    welded = mesh.copy()
-    welded.merge_vertices(merge_tex=True, merge_norm=True)  # a vertex per face corner cannot be decimated
-    light = welded.simplify_quadric_decimation(face_count=wanted)
-    if len(light.faces) > 2 * wanted and max(mesh.extents) < SMALL:
-        light = welded.convex_hull  # a hand camera's screws and lenses: a thousand separate parts resist decimation
-    if material is not None:
-        light.visual = trimesh.visual.TextureVisuals(material=material)
-    return light
+def _may_change(record: Any) -> bool:
+    # a material with a texture of its own needs the original's texture coordinates
+    textured = record.material is not None and record.material.base_color_texture is not None
+    return MEASURED not in record.name and not textured
 
 
 # ---------------------------------------------------------------------- floor
