@@ -42,12 +42,11 @@ def check_arguments(
     for name, share in (("challenge_ratio", challenge_ratio), ("demonstration_ratio", demonstration_ratio)):
         if not 0 <= share <= 1:
             raise ValueError(f"{name} is a share of the batches and must lie in [0, 1], got {share}")
-    if (
-        challenge_ratio + demonstration_ratio > 1 and demonstration_ratio != 0.1
-    ):  # 0.1: the default, unused without demonstrations
+    # 0.1 is the default and means nothing without demonstrations
+    if challenge_ratio + demonstration_ratio > 1 and demonstration_ratio != 0.1:
         raise ValueError(
-            f"challenge_ratio={challenge_ratio} and demonstration_ratio={demonstration_ratio} are shares of the same batches and must "
-            "not exceed 1 together"
+            f"challenge_ratio={challenge_ratio} and demonstration_ratio={demonstration_ratio} are shares of the same batches "
+            "and must not exceed 1 together"
         )
     if challenge_ratio > 0 and not isinstance(action_space, spaces.Box):
         raise ValueError(
@@ -113,6 +112,6 @@ def unreadable(path: str | Path, error: Exception) -> ValueError:
     """What to say of a file that pickle cannot read."""
     size = Path(path).stat().st_size
     return ValueError(
-        f"{path} ({size:,} bytes) is not a complete saved CPMBuffer: {error or type(error).__name__}. It may have been cut off "
-        "while it was written (CPMBuffer.save never leaves half a file); take an earlier one."
+        f"{path} ({size:,} bytes) is not a complete saved CPMBuffer: {error or type(error).__name__}. It may have been "
+        "cut off while it was written (CPMBuffer.save never leaves half a file); take an earlier one."
     )

@@ -90,7 +90,7 @@ class _CastCodec(Codec):
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
         if self.dtype == np.float32:  # several times faster in torch than in NumPy
-            return th.from_numpy(np.ascontiguousarray(stored)).float().numpy()
+            return th.from_numpy(stored.copy()).float().numpy()
         return stored.astype(self.dtype)
 
 
@@ -196,7 +196,7 @@ def make_codecs(
     for key, shape in shapes.items():
         dtype = space.spaces[key].dtype
         spec = specs.get(key)
-        if spec is None or (isinstance(spec, str) and np.dtype(spec) == dtype):
+        if spec is None or spec == str(dtype):
             codecs[key] = Codec(key, shape, dtype)
         elif np.dtype(dtype).kind != "f":
             raise ValueError(f"storage_dtypes[{key!r}]: only floats can be stored smaller, this one is {dtype} already")

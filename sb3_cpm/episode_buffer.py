@@ -14,6 +14,7 @@ transitions of complete episodes, u of unfinished ones::
 import copy
 import os
 import pickle
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -490,10 +491,14 @@ class EpisodeBuffer(HerReplayBuffer):
 
     def truncate_last_trajectory(self) -> None:
         """As the parent's, and also for an episode that fills the buffer exactly."""
-        if (self._began < self._n_steps).any() and (self._current_ep_start == self.pos).all():
-            for env_idx in np.flatnonzero(self._began < self._n_steps):
-                self._truncate_episode(int(env_idx))
-        super().truncate_last_trajectory()
+        unfinished = np.flatnonzero(self._began < self._n_steps).tolist()
+        if unfinished:
+            warnings.warn(
+                "The last trajectory in the replay buffer will be truncated. If you are in the same episode as when the replay "
+                "buffer was saved, you should use `truncate_last_traj=False` to avoid that."
+            )
+        for env_idx in unfinished:
+            self._truncate_episode(env_idx)
 
     def save(self, path: str | Path) -> None:
         """

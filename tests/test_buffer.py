@@ -60,7 +60,9 @@ class Played:
         self.buffer.add(obs, self.observation(), action, reward, done, infos)
         self.n_steps += 1
         for env_idx in np.flatnonzero(done):
-            self.complete.append((env_idx, self.episode[env_idx], self.began[env_idx], self.step[env_idx], terminated[env_idx]))
+            self.complete.append(
+                (env_idx, self.episode[env_idx], self.began[env_idx], self.step[env_idx], terminated[env_idx])
+            )
             self.episode[env_idx] += 1
             self.step[env_idx] = 0
             self.began[env_idx] = self.n_steps
@@ -75,7 +77,9 @@ class Played:
 
     def evaluate(self, episode, seed=0, goal=None):
         rng = np.random.default_rng(seed)
-        evaluation = Evaluation(0.1 * rng.random(episode.length), rng.random(episode.length), rng.random((episode.length + 1, 4)))
+        evaluation = Evaluation(
+            0.1 * rng.random(episode.length), rng.random(episode.length), rng.random((episode.length + 1, 4))
+        )
         if goal is not None:
             evaluation.disagreement[goal] = 50.0
         return evaluation
@@ -85,7 +89,10 @@ def check_transitions(samples, present):
     """Every row is a transition of a present episode, as it was played."""
     terminated = {(env, ep): (length, term) for env, ep, length, term in present}
     for obs, next_obs, action, done in zip(
-        samples.observations["state"].numpy(), samples.next_observations["state"].numpy(), samples.actions.numpy(), samples.dones.numpy()
+        samples.observations["state"].numpy(),
+        samples.next_observations["state"].numpy(),
+        samples.actions.numpy(),
+        samples.dones.numpy(),
     ):
         env, ep, step = obs
         length, term = terminated[env, ep]
@@ -164,7 +171,9 @@ def test_samples_are_uniform_over_complete_episodes():
     for _ in range(100):
         played.play((rng.random(3) < 0.2) | (played.step >= 20))
     expected = {(env, ep, step) for env, ep, n, _ in played.present() for step in range(n)}
-    rows, counts = np.unique(played.buffer.sample(200 * len(expected)).observations["state"].numpy(), axis=0, return_counts=True)
+    rows, counts = np.unique(
+        played.buffer.sample(200 * len(expected)).observations["state"].numpy(), axis=0, return_counts=True
+    )
     assert {tuple(row) for row in rows} == expected
     chi_square = ((counts - 200) ** 2 / 200).sum()
     assert chi_square < len(expected) + 4 * np.sqrt(2 * len(expected))
@@ -385,3 +394,71 @@ def test_sampling_too_early_says_what_to_set():
         played.buffer.sample(4)
     with pytest.raises(RuntimeError, match="No complete episode"):
         played.buffer.sample_sequences(4, 4)
+
+
+def test_refresh_gives_todays_rewards_to_the_challenges_that_are_due():
+    played = Played(size=100, refresh_every=20, filter_kwargs=LENIENT)
+    played.play_episode(15)
+    (episode,) = played.buffer.pop_completed()
+    assert played.buffer.propose(episode, played.evaluate(episode, goal=10)).accepted
+    played.play_episode(19)
+    assert played.buffer.due_for_refresh() == []
+    played.play(False)
+    (challenge,) = played.buffer.due_for_refresh()
+    assert challenge.age == 20 and challenge.added_at == 15
+    np.random.seed(0)
+    while played.buffer.pop_sampled_age() is None:
+        played.buffer.sample(8)
+    coefficients, rewards_of_d = played.buffer.coefficients, played.buffer.rewards.copy()
+    before = pickle.dumps(played.buffer.challenges)
+    with pytest.raises(ValueError, match="kl has shape"):
+        played.buffer.refresh(challenge, played.evaluate(episode)._replace(kl=np.zeros(3)))
+    assert pickle.dumps(played.buffer.challenges) == before
+
+    assert played.buffer.refresh(challenge, played.evaluate(episode, seed=0, goal=10)) < 0.5
+    change = played.buffer.refresh(challenge, played.evaluate(episode, seed=1))
+    assert change > 0
+    (refreshed,) = played.buffer.challenges
+    assert refreshed.age == 0 and refreshed.goal == challenge.goal and played.buffer.due_for_refresh() == []
+    assert not np.array_equal(refreshed.rewards, challenge.rewards)
+    np.testing.assert_array_equal(refreshed.terms["extrinsic"], challenge.terms["extrinsic"])
+    np.testing.assert_array_equal(refreshed.terms["step"], challenge.terms["step"])
+    assert played.buffer.coefficients == coefficients and played.buffer.counters.refreshed == 2
+    np.testing.assert_array_equal(played.buffer.rewards, rewards_of_d)
+    played.play_episode(90)
+    with pytest.raises(ValueError, match="no longer in the buffer"):
+        played.buffer.refresh(challenge, played.evaluate(episode))
+
+
+def test_what_is_in_the_buffer_can_be_looked_at():
+    played = Played(n_envs=2, size=60, filter_kwargs=LENIENT)
+    played.play_episode(20)
+    for episode in played.buffer.pop_completed():
+        played.buffer.propose(episode, played.evaluate(episode, goal=12))
+    played.play_episode(10)
+    first, second = played.buffer.challenges
+    assert (first.environment, second.environment) == (0, 1)
+    assert (first.start, first.goal, first.age) == (5, 12, 20) and first.score > 10
+    assert set(first.terms) == {"extrinsic", "exploration", "embedding", "step"}
+    assert all(term.shape == first.rewards.shape == (8,) for term in first.terms.values())
+    assert [(e.env_idx, e.start, e.length, e.ordinal) for e in played.buffer.episodes] == [
+        (0, 0, 20, 0), (0, 20, 10, 1), (1, 0, 20, 0), (1, 20, 10, 1),
+    ]  # fmt: skip
+    assert played.buffer.counters.proposed == 2
+
+
+@pytest.mark.parametrize("rewards", [0.0, -1.0])
+@pytest.mark.parametrize("length", [1, 5, 6, 20])
+def test_degenerate_episodes_have_documented_outcomes(rewards, length):
+    """One step, exactly the warm-up, one counted step; rewards all zero or negative; all scores equal."""
+    buffer = CPMBuffer(50, OBSERVATION_SPACE, ACTION_SPACE, device="cpu")
+    buffer.has_challenger = True
+    obs = {"state": np.zeros((1, 3), np.float32), "camera": np.zeros((1, 2, 2, 3), np.uint8)}
+    for step in range(length):
+        buffer.add(obs, obs, np.zeros((1, 2)), np.array([rewards]), np.array([step == length - 1]), [{}])
+    (episode,) = buffer.pop_completed()
+    proposal = buffer.propose(episode, Evaluation(np.full(length, 0.5), np.full(length, 0.5), np.zeros((length + 1, 2))))
+    assert (proposal is None) == (length <= 5)
+    assert proposal is None or (not proposal.accepted and not proposal.verdicts["not_first"])
+    assert np.isfinite([value for name, value in buffer.coefficients.items()]).all() and not buffer.challenges
+    assert buffer.sample(10).rewards.unique().tolist() == [rewards]

@@ -1,0 +1,184 @@
+"""Demonstrations: never overwritten, sampled at their own ratio, read from ManiSkill's trajectory files."""
+
+import json
+import types
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_cpm.buffers import CPMBuffer, Demonstration
+
+h5py = pytest.importorskip("h5py", reason="h5py comes with mani_skill")
+
+SPACE = spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (2,), np.float32)})
+ACTIONS = spaces.Box(-2, 2, (1,), np.float32)
+
+
+def make(size=30, **kwargs):
+    return CPMBuffer(size, SPACE, ACTIONS, device="cpu", **{"challenge_ratio": 0, **kwargs})
+
+
+def demonstration(number, length, terminated=True):
+    state = np.stack([np.full(length + 1, number), np.arange(length + 1)], axis=1).astype(np.float32)
+    return Demonstration({"state": state}, np.full((length, 1), 1.0), np.arange(length) + 1.0, terminated)
+
+
+def play(buffer, length):
+    for step in range(length):
+        obs, next_obs = ({"state": np.array([[0, s]], np.float32)} for s in (step, step + 1))
+        buffer.add(obs, next_obs, np.zeros((1, 1)), np.zeros(1), np.array([step == length - 1]), [{}])
+
+
+@pytest.mark.parametrize("mix", ["batch", "row"])
+def test_share_of_demonstrations(mix):
+    np.random.seed(0)
+    buffer = make(mix=mix, demonstration_ratio=0.3)
+    assert buffer.add_demonstrations([demonstration(1, 4), demonstration(2, 6, terminated=False)]) == 2
+    assert set(buffer.sample(100).observations["state"][:, 0].tolist()) == {1.0, 2.0}, "D is empty still"
+    for _ in range(5):
+        play(buffer, 20)  # D is overwritten more than once
+    assert buffer.add_demonstrations([demonstration(3, 5)]) == 1
+    assert [episode.length for episode in buffer.demonstrations.episodes] == [4, 6, 5]
+    shares = [(buffer.sample(20).observations["state"][:, 0] > 0).float().mean().item() for _ in range(1000)]
+    assert np.mean(shares) == pytest.approx(0.3, abs=0.05)
+    assert set(np.round(shares, 5)) == ({0.0, 1.0} if mix == "batch" else {0.3})
+    batch = buffer.sample_sequences(2000, 3)
+    assert (batch.observations["state"][0, :, 0] > 0).mean() == pytest.approx(0.3, abs=0.05)
+
+
+def test_actions_and_ends_are_stored_as_in_d():
+    np.random.seed(0)
+    buffer = make()
+    buffer.add_demonstrations([demonstration(1, 4), demonstration(2, 4, terminated=False)])
+    samples = buffer.sample(200)
+    assert (samples.actions == 0.5).all(), "scaled to [-1, 1]"
+    last = samples.observations["state"][:, 1] == 3
+    assert (samples.dones.flatten() == (last & (samples.observations["state"][:, 0] == 1))).all()
+    assert (samples.next_observations["state"][:, 1] == samples.observations["state"][:, 1] + 1).all()
+    assert (samples.rewards.flatten() == samples.observations["state"][:, 1] + 1).all()
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        (dict(rewards=np.zeros(0)), "no steps"),
+        (dict(rewards=np.array([1.0, np.nan, 1.0])), "finite"),
+        (dict(actions=np.full((3, 1), 2.5)), "outside of"),
+        (dict(actions=np.zeros((3, 2))), r"shape \(3, 2\)"),
+        (dict(observations={"state": np.zeros((3, 2))}), r"expected \(4, 2\)"),
+        (dict(observations={"stat": np.zeros((4, 2))}), "lacks the observations"),
+    ],
+)
+def test_bad_demonstrations_add_nothing(changes, message):
+    buffer = make()
+    buffer.add_demonstrations([demonstration(1, 4)])
+    good = demonstration(2, 3)
+    bad = Demonstration(**{**vars(good), **changes})
+    with pytest.raises(ValueError, match=message):
+        buffer.add_demonstrations([good, bad])
+    assert [episode.length for episode in buffer.demonstrations.episodes] == [4]
+    with pytest.raises(ValueError, match="No demonstrations"):
+        buffer.add_demonstrations([])
+
+
+def test_shares_that_exceed_one():
+    with pytest.raises(ValueError, match="not exceed 1 together"):
+        make(challenge_ratio=0.7, demonstration_ratio=0.5)
+
+
+# ---------------------------------------------------------------------- files
+
+
+class CounterEnv(gym.Env):
+    """The state is (seed, sum of the actions); success when the sum reaches 3."""
+
+    def __init__(self):
+        self.observation_space, self.action_space = SPACE, ACTIONS
+
+    def reset(self, *, seed=None, options=None):
+        self.state = np.array([seed, 0], np.float32)
+        return {"state": self.state.copy()}, {}
+
+    def step(self, action):
+        self.state[1] += action[0]
+        return {"state": self.state.copy()}, float(self.state[1]), False, False, {"is_success": bool(self.state[1] >= 3)}
+
+
+def write(folder, lengths, obs=None, rewards=False, actions_shape=(1,), **index):
+    """What ManiSkill's RecordEpisode writes, as far as it is read here."""
+    episodes = []
+    with h5py.File(folder / "demos.h5", "w") as file:
+        for number, length in enumerate(lengths):
+            group = file.create_group(f"traj_{number}")
+            group.create_dataset("actions", data=np.ones((length, *actions_shape), np.float32))
+            group.create_dataset("terminated", data=np.arange(length) == length - 1)
+            group.create_dataset("truncated", data=np.zeros(length, bool))
+            if obs == "dict":
+                group.create_group("obs").create_dataset("state", data=demonstration(number, length).observations["state"])
+            elif obs == "flat":
+                group.create_dataset("obs", data=demonstration(number, length).observations["state"])
+            elif obs == "other":
+                group.create_dataset("obs", data=np.zeros((length + 1, 42)))
+            if rewards:
+                group.create_dataset("rewards", data=np.ones(length, np.float32))
+            episodes.append(dict(episode_id=number, episode_seed=10 + number, control_mode="pd_ee_delta_pos", success=True))
+    index = {"env_info": {"env_id": "Counter-v1", "env_kwargs": {"obs_mode": "state"}}, "episodes": episodes, **index}
+    (folder / "demos.json").write_text(json.dumps(index))
+    return folder / "demos.h5"
+
+
+@pytest.mark.parametrize("obs", ["dict", "flat"])
+def test_observations_of_the_file_are_taken_where_they_fit(obs, tmp_path):
+    buffer = make()
+    assert buffer.add_demonstrations(write(tmp_path, [4, 5], obs, rewards=True)) == 2
+    episode = buffer.demonstrations.episodes[1]
+    np.testing.assert_array_equal(buffer.demonstrations.episode_observations(episode)["state"][:, 1], np.arange(6))
+
+
+def test_otherwise_the_actions_are_replayed(tmp_path, caplog):
+    buffer = make()
+    path = write(tmp_path, [4, 2, 3], "other")
+    with pytest.raises(ValueError, match=r"obs_mode is 'state'.*env=make_maniskill_env\('Counter-v1'"):
+        buffer.add_demonstrations(path)
+    assert buffer.demonstrations is None
+    assert buffer.add_demonstrations(str(path), env=CounterEnv()) == 2
+    assert "1 of 3 episodes did not succeed" in caplog.text
+    first, third = buffer.demonstrations.episodes
+    np.testing.assert_array_equal(buffer.demonstrations.episode_observations(third)["state"], [[12, i] for i in range(4)])
+
+
+@pytest.mark.parametrize("broken", ["no json", "json", "truncated", "no file", "actions", "other json", "start"])
+def test_files_that_cannot_be_read(broken, tmp_path):
+    path = write(tmp_path, [4], "flat", rewards=True, actions_shape=(8,) if broken == "actions" else (1,))
+    env, messages = (
+        CounterEnv(),
+        {"actions": "replay_trajectory", "other json": "don't belong together", "start": "starts elsewhere"},
+    )
+    if broken == "no json":
+        path.with_suffix(".json").unlink()
+    elif broken == "json":
+        path.with_suffix(".json").write_text("{")
+    elif broken == "truncated":
+        path.write_bytes(path.read_bytes()[:500])
+    elif broken == "no file":
+        path.unlink()
+    elif broken == "other json":
+        path.with_suffix(".json").write_text(json.dumps({"episodes": [{"episode_id": 7}]}))
+    elif broken == "start":
+        path = write(tmp_path, [4])
+        with h5py.File(path, "a") as file:
+            file["traj_0"].create_dataset("env_states/actors/cube", data=np.ones((5, 13)))
+        cube = types.SimpleNamespace(cpu=lambda: np.zeros((1, 13)))
+        env.get_state_dict = lambda: {"actors": {"cube": cube}}
+    messages |= {
+        "no json": "there is no",
+        "json": "does not list episodes",
+        "truncated": "HDF5",
+        "no file": "There is no file",
+    }
+    buffer = make()
+    with pytest.raises(ValueError, match=messages[broken]):
+        buffer.add_demonstrations(path, env=env)
+    assert buffer.demonstrations is None
