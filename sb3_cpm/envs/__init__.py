@@ -4,8 +4,8 @@ Environments. The only place that imports ManiSkill or SAPIEN, and only when an 
 """
 
 from sb3_cpm.envs.maniskill import ManiSkillEnv, make_maniskill_env
-from sb3_cpm.envs.vec_env import ManiSkillVecEnv, make_maniskill_vec_env
 from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.envs.vec_env import ManiSkillVecEnv, make_maniskill_vec_env
 from sb3_cpm.envs.vulkan import forget_failed_opencv
 from sb3_cpm.envs.wrappers import DictObservation
 

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -54,7 +53,7 @@ class ManiSkillBatch:
 
     def __init__(
         self,
-        env: gym.Env,
+        env: Any,
         cameras: Sequence[str] | None,
         obs_mode: str,
         cloud: clouds.CloudSettings,
@@ -62,7 +61,7 @@ class ManiSkillBatch:
         ignore_terminations: bool,
         visuals: Visuals,
     ):
-        self.env: Any = env
+        self.env = env
         self.num_envs: int = self.env.num_envs
         self.obs_mode = obs_mode
         self.cloud = cloud
@@ -128,8 +127,11 @@ class ManiSkillBatch:
                 part[key][:] = [bool(state and state["grasps"].get(key)) for state in states]
         self._remember_grasps(host, rows)
         observations = self._observe(host, rows, host["info"]["elapsed_steps"])
+        # not in place: the arrays of the last step belong to whoever took that step
+        last = {key: value.copy() for key, value in self._last.items()}
         for key, value in observations.items():
-            self._last[key][rows] = value
+            last[key][rows] = value
+        self._last = last
         return observations, self._infos(host["info"], len(rows))
 
     def step(self, actions: np.ndarray) -> BatchStep:

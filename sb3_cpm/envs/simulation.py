@@ -35,8 +35,8 @@ def choose_simulation(num_envs: int, sim_backend: str, task_kwargs: Mapping[str,
         )
     if num_envs > 1 and kwargs.setdefault("reconfiguration_freq", 0) != 0:
         raise ValueError(
-            f"reconfiguration_freq={kwargs['reconfiguration_freq']} rebuilds the scene between episodes, but the environments of "
-            "a batch end theirs at different times. Leave it at 0, or use num_envs=1 in several processes."
+            f"reconfiguration_freq={kwargs['reconfiguration_freq']} rebuilds the scene between episodes, but the environments "
+            "of a batch end theirs at different times. Leave it at 0, or use num_envs=1 in several processes."
         )
     if sim_backend != "physx_cpu":
         check_gpu_simulation(sim_backend)

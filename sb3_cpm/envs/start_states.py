@@ -3,8 +3,8 @@ Starting an episode from a stored state (report, appendix A.1: a challenge may s
 
 What a simulation must be given to go on as it did: the episode's seed (it rules what is not part of the simulator's state: the
 geometry of tasks that build a new scene per episode, fields like TurnFaucet's target), the simulator's state, what the
-controller remembers (without the target pose of ``pd_ee_target_delta_pose`` the arm goes elsewhere), the step counter, and what the
-gripper feels, which the simulator only knows again after the next step.
+controller remembers (without the target pose of ``pd_ee_target_delta_pose`` the arm goes elsewhere), the step counter, and
+what the gripper feels, which the simulator only knows again after the next step.
 
 The same actions then give the same trajectory up to small numbers: measured on PickCube, 25 actions, rewards within 1e-5 and
 observations within 1e-4. Two things are not stored by PhysX, the solver's warm start and contacts: while the arm presses

@@ -32,8 +32,8 @@ class ManiSkillVecEnv(VecEnv):
     """
     Use :func:`make_maniskill_vec_env` to get one. No ``Monitor`` and no ``VecMonitor`` is needed.
 
-    Seeds: ``seed(s)`` gives environment ``i`` the seed ``s + i`` at the next ``reset()``, and all its later episodes follow from
-    that. Start states as for :class:`~sb3_cpm.envs.maniskill.ManiSkillEnv`.
+    Seeds: ``seed(s)`` gives environment ``i`` the seed ``s + i`` at the next ``reset()``, and all its later episodes follow
+    from that. Start states as for :class:`~sb3_cpm.envs.maniskill.ManiSkillEnv`.
 
     :param batch: a simulation of any number of environments
     """
@@ -142,8 +142,8 @@ class ManiSkillVecEnv(VecEnv):
 
 class Member:
     """
-    One environment of the batch, as ``get_attr``, ``set_attr`` and ``env_method`` see it. What it does not have itself it takes
-    from the batch and from ManiSkill's environment, which all members share; what is set is set for this member alone.
+    One environment of the batch, as ``get_attr``, ``set_attr`` and ``env_method`` see it. What it does not have itself it
+    takes from the batch and from ManiSkill's environment, which all members share; what is set is set for this member alone.
     """
 
     def __init__(self, vec_env: ManiSkillVecEnv, i: int):
