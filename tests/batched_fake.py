@@ -1,7 +1,7 @@
 """
 Stands in for ManiSkill's environment with any number of environments in one simulation, which needs a GPU: the parts of its
-interface that the package uses, with its manners: batched tensors, the same live buffers in every observation, torch seeded with
-the seed of environment 0, partial resets by ``env_idx``.
+interface that the package uses, with its manners: batched tensors, the same live buffers in every observation, torch seeded
+with the seed of environment 0, partial resets by ``env_idx``.
 """
 
 from types import SimpleNamespace

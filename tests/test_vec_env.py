@@ -1,6 +1,6 @@
 """
-ManiSkillVecEnv: the batched code with several environments on a stand-in for the simulation (tests/batched_fake.py), and the real
-one with the single environment that a CPU can simulate.
+ManiSkillVecEnv: the batched code with several environments on a stand-in for the simulation (tests/batched_fake.py), and the
+real one with the single environment that a CPU can simulate.
 """
 
 import contextlib
@@ -18,6 +18,7 @@ import torch as th
 from batched_fake import FakeManiSkill
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecEnv, VecNormalize
@@ -76,8 +77,7 @@ def test_spaces_hold_the_observations_of_one() -> None:
 def test_what_was_given_away_never_changes() -> None:
     env = fake()
     given: list[Any] = [env.reset()]
-    for _ in range(14):  # over the ends of two episodes
-        given.append(env.step(np.ones((3, 2), dtype=np.float32)))
+    given += [env.step(np.ones((3, 2), dtype=np.float32)) for _ in range(14)]  # over the ends of two episodes
     kept = pickle.dumps(given)
     for _ in range(14):
         env.step(-np.ones((3, 2), dtype=np.float32))
@@ -141,10 +141,8 @@ def test_seeds_rule_the_whole_run() -> None:
         env = fake(limit=3)
         env.seed(seed)
         frames: list[Any] = [env.reset()]
-        rng = np.random.default_rng(0)
-        for _ in range(10):
-            frames.append(env.step(rng.uniform(-1, 1, (3, 2)).astype(np.float32))[0])
-        return frames
+        actions = np.random.default_rng(0).uniform(-1, 1, (10, 3, 2)).astype(np.float32)
+        return frames + [env.step(action)[0] for action in actions]
 
     for one, other in zip(run(5), run(5), strict=True):
         assert_equal(one, other)
@@ -347,6 +345,34 @@ def test_the_same_as_the_single_environment(real: ManiSkillVecEnv) -> None:
             assert (episode["r"], episode["l"]) == (pytest.approx(their_episode["r"], abs=1e-5), their_episode["l"])
         assert info == other
     single.close()
+
+
+class AsGym(gym.Env):
+    """One environment of a VecEnv as gymnasium sees it, for SB3's checker."""
+
+    def __init__(self, vec_env: VecEnv):
+        self.vec_env = vec_env
+        self.observation_space, self.action_space = vec_env.observation_space, vec_env.action_space
+        self.render_mode = vec_env.render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Tree, dict[str, Any]]:
+        if seed is not None:
+            self.vec_env.seed(seed)
+        return row(self.vec_env.reset(), 0), self.vec_env.reset_infos[0]  # type: ignore[arg-type]
+
+    def step(self, action: np.ndarray) -> tuple[Tree, float, bool, bool, dict[str, Any]]:
+        observations, rewards, dones, infos = self.vec_env.step(action[None])
+        return row(observations, 0), float(rewards[0]), bool(dones[0]), False, infos[0]  # type: ignore[arg-type]
+
+    def render(self) -> Any:
+        return self.vec_env.render()
+
+
+@pytest.mark.maniskill
+def test_checker_of_sb3(real: ManiSkillVecEnv) -> None:
+    with quietly():
+        check_env(AsGym(real))
+        check_env(AsGym(fake(num_envs=1)))
 
 
 @contextlib.contextmanager
