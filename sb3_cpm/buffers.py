@@ -31,9 +31,10 @@ from sb3_cpm.challenges import ChallengeCurator, Proposal
 from sb3_cpm.compact import StorageSpec
 from sb3_cpm.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.episode_buffer import EpisodeBuffer
-from sb3_cpm.imaginary import Challenge, ChallengeCounters, Episode, ImaginaryBuffer
+from sb3_cpm.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
 from sb3_cpm.sequences import side_by_side
 from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.storage import Episode
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 
 __all__ = ["EXECUTED_ACTION", "CPMBuffer", "Challenge", "ChallengeCounters", "Demonstration", "Episode"]
@@ -361,8 +362,8 @@ class CPMBuffer(EpisodeBuffer):
         Add recorded episodes. They are never overwritten, and are sampled with ``demonstration_ratio``.
 
         :param source: ManiSkill's trajectory file (``.h5``, with the ``.json`` of the same name beside it), or episodes
-        :param env: a single environment, as made for training, in which recorded actions are replayed where the file does not
-            hold this buffer's observations
+        :param env: a single environment, as made for training, in which the recorded actions are replayed; needed unless the
+            file holds this buffer's observations and rewards
         :return: number of episodes added
         :raises ValueError: for files and episodes that don't fit; nothing is added then
         """

@@ -3,8 +3,8 @@ Demonstrations: recorded episodes for :meth:`CPMBuffer.add_demonstrations <sb3_c
 
 Reads ManiSkill's trajectory files (``RecordEpisode``, or its solvers): ``name.h5`` holds ``traj_0, traj_1, ...`` with
 ``actions`` (T, A), ``terminated`` and ``truncated`` (T,), sometimes ``rewards`` (T,) and ``obs`` (T + 1, ...);
-``name.json`` holds the task, controller and seed of each. Their observations are seldom the training environment's: then the
-recorded actions are replayed in it, from the recorded seeds.
+``name.json`` holds the task, controller and seed of each. Their observations are seldom the training environment's: pass
+one, and the recorded actions are replayed in it, from the recorded seeds.
 """
 
 import json
@@ -44,7 +44,7 @@ def read_demonstrations(
     :param path: the ``.h5`` file; the ``.json`` of the same name is read too
     :param observation_space: what the observations must be
     :param action_space: what the actions must be
-    :param env: environment to replay the actions in where the file does not hold such observations
+    :param env: environment to replay the actions in; None: take the observations that the file holds, if they are such
     :return: its episodes
     :raises ValueError: if that cannot be done, and how it could
     """
@@ -65,7 +65,7 @@ def read_demonstrations(
                 raise ValueError(f"{path} has no {name}, which the .json file lists; the files don't belong together")
             recorded = file[name]
             _check_actions(recorded["actions"].shape[1:], action_space, record, path)
-            observations = _recorded_observations(recorded, observation_space)
+            observations = _recorded_observations(recorded, observation_space) if env is None else None
             if observations is not None and "rewards" in recorded:
                 episodes.append(
                     Demonstration(

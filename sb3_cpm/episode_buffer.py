@@ -32,9 +32,8 @@ from typing_extensions import Self
 from sb3_cpm.allocation import InFolder, check_space, in_memory
 from sb3_cpm.buffer_checks import check_environment, check_spaces, checked_rewards, unreadable
 from sb3_cpm.compact import StorageSpec, make_codecs
-from sb3_cpm.imaginary import Episode
 from sb3_cpm.sequences import draw_starts, read_sequences
-from sb3_cpm.storage import NextObservationView, ObservationRing, Transitions
+from sb3_cpm.storage import Episode, NextObservationView, ObservationRing, Transitions
 from sb3_cpm.type_aliases import SequenceBatch
 
 #: Changes whenever a pickled buffer of an earlier release could be misread.
@@ -494,8 +493,8 @@ class EpisodeBuffer(HerReplayBuffer):
         unfinished = np.flatnonzero(self._began < self._n_steps).tolist()
         if unfinished:
             warnings.warn(
-                "The last trajectory in the replay buffer will be truncated. If you are in the same episode as when the replay "
-                "buffer was saved, you should use `truncate_last_traj=False` to avoid that."
+                "The last trajectory in the replay buffer will be truncated. If you are in the same episode as when the "
+                "replay buffer was saved, you should use `truncate_last_traj=False` to avoid that."
             )
         for env_idx in unfinished:
             self._truncate_episode(env_idx)

@@ -11,27 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sb3_cpm.challenges import CRITERIA, Proposal
-
-
-@dataclass(frozen=True)
-class Episode:
-    """
-    A complete episode in D.
-
-    :param env_idx: environment that it was played in
-    :param start: slot of its first transition in the ring
-    :param length: number of transitions
-    :param ordinal: how many episodes of this environment came before it
-    """
-
-    env_idx: int
-    start: int
-    length: int
-    ordinal: int
-
-    def slots(self, buffer_size: int) -> np.ndarray:
-        """Slots of its transitions in a ring of ``buffer_size``, shape ``(length,)``."""
-        return np.arange(self.start, self.start + self.length) % buffer_size
+from sb3_cpm.storage import Episode
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,34 @@ then it waits beside the ring. An example of four slots::
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_cpm.allocation import Allocate
 from sb3_cpm.compact import Codec
+
+
+@dataclass(frozen=True)
+class Episode:
+    """
+    A complete episode in D.
+
+    :param env_idx: environment that it was played in
+    :param start: slot of its first transition in the ring
+    :param length: number of transitions
+    :param ordinal: how many episodes of this environment came before it
+    """
+
+    env_idx: int
+    start: int
+    length: int
+    ordinal: int
+
+    def slots(self, buffer_size: int) -> np.ndarray:
+        """Slots of its transitions in a ring of ``buffer_size``, shape ``(length,)``."""
+        return np.arange(self.start, self.start + self.length) % buffer_size
 
 
 class Transitions(NamedTuple):

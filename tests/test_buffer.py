@@ -56,7 +56,7 @@ class Played:
         action = np.stack([self.episode, self.step], axis=1) / 1000
         reward = reward_of(self.episode, self.step)
         self.step = self.step + 1
-        infos = [{"TimeLimit.truncated": bool(d and not t)} for d, t in zip(done, terminated)]
+        infos = [{"TimeLimit.truncated": bool(d and not t)} for d, t in zip(done, terminated, strict=True)]
         self.buffer.add(obs, self.observation(), action, reward, done, infos)
         self.n_steps += 1
         for env_idx in np.flatnonzero(done):
@@ -93,6 +93,7 @@ def check_transitions(samples, present):
         samples.next_observations["state"].numpy(),
         samples.actions.numpy(),
         samples.dones.numpy(),
+        strict=True,
     ):
         env, ep, step = obs
         length, term = terminated[env, ep]
@@ -318,7 +319,7 @@ def test_save_and_load_keep_everything(tmp_path):
     loaded = pickle.loads(pickle.dumps(played.buffer))
     assert loaded.coefficients == played.buffer.coefficients and loaded.counters == played.buffer.counters
     assert len(loaded.challenges) == len(played.buffer.challenges) > 0
-    for challenge, original in zip(loaded.challenges, played.buffer.challenges):
+    for challenge, original in zip(loaded.challenges, played.buffer.challenges, strict=True):
         assert challenge.episode == original.episode
         np.testing.assert_array_equal(challenge.proposal.artificial.total, original.proposal.artificial.total)
     for seed in range(20):

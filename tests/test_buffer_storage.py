@@ -79,7 +79,7 @@ def test_what_comes_back_is_what_went_in(kwargs, in_files, tmp_path):
             samples = buffer.sample(100)
             for observations, ahead in ((samples.observations, 0), (samples.next_observations, 1)):
                 assert observations[key].dtype == th.float32
-                for row, step in zip(observations[key].numpy(), samples.observations["state"][:, 0].numpy()):
+                for row, step in zip(observations[key].numpy(), samples.observations["state"][:, 0].numpy(), strict=True):
                     np.testing.assert_allclose(row, observation(int(step) + ahead)[key][0], atol=tolerance)
             batch = buffer.sample_sequences(5, 6)
             states = batch.observations["state"][..., 0]

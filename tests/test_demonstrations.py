@@ -145,7 +145,7 @@ def test_otherwise_the_actions_are_replayed(tmp_path, caplog):
     assert buffer.demonstrations is None
     assert buffer.add_demonstrations(str(path), env=CounterEnv()) == 2
     assert "1 of 3 episodes did not succeed" in caplog.text
-    first, third = buffer.demonstrations.episodes
+    _, third = buffer.demonstrations.episodes
     np.testing.assert_array_equal(buffer.demonstrations.episode_observations(third)["state"], [[12, i] for i in range(4)])
 
 
@@ -182,3 +182,28 @@ def test_files_that_cannot_be_read(broken, tmp_path):
     with pytest.raises(ValueError, match=messages[broken]):
         buffer.add_demonstrations(path, env=env)
     assert buffer.demonstrations is None
+
+
+@pytest.mark.maniskill
+def test_scripted_pickcube_is_recorded_and_replayed(tmp_path):
+    """Recorded in state mode, as ManiSkill's own demonstrations are; replayed with images and clouds."""
+    from sb3_cpm.envs import make_maniskill_env
+    from sb3_cpm.envs.scripted import record
+
+    path = record(tmp_path, 3)
+    with h5py.File(path) as file:
+        assert all(file[name]["success"][-1] for name in file)
+    env = make_maniskill_env("PickCube-v1", n_points=32, goal_points=8)
+    buffer = CPMBuffer(100, env.observation_space, env.action_space, device="cpu", challenge_ratio=0)
+    assert buffer.add_demonstrations(path, env=env) == 3
+    for episode in buffer.demonstrations.episodes:
+        observations = buffer.demonstrations.episode_observations(episode)
+        assert observations["hand_camera"].shape[0] == episode.length + 1 <= 51
+    samples = buffer.sample(64)
+    assert samples.observations["pointcloud"].shape == (64, 40, 6)
+    assert samples.rewards.max() == 1.0, "success"
+    other = make_maniskill_env("PickCube-v1", obs_mode="state", control_mode="pd_joint_delta_pos")
+    with pytest.raises(ValueError, match=r"actions of shape \(7,\) \(controller pd_ee_delta_pose\).*replay_trajectory"):
+        CPMBuffer(100, other.observation_space, other.action_space, device="cpu").add_demonstrations(path, env=other)
+    other.close()
+    env.close()
