@@ -1,5 +1,5 @@
 """
-The command line: ``python -m sb3_cpm train | doctor | setup-rendering``.
+The command line: ``python -m sb3_cpm train | doctor | setup-rendering | assets``.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -71,6 +71,16 @@ def make_parser() -> argparse.ArgumentParser:
     )
     rendering.add_argument("--private", action="store_true", help="install privately even as root")
     rendering.set_defaults(command=_setup_rendering)
+
+    assets = commands.add_parser(
+        "assets",
+        help="the files that ManiSkill's tasks need: whether they are there, and how to get them",
+        description="List the tasks of the report (or those named), the files that they need, whether these are there and "
+        "complete, and the command that gets them. Exit status 1 if something is wanting.",
+    )
+    assets.add_argument("env_ids", nargs="*", metavar="TASK", help="for instance PickSingleYCB-v1; by default the report's")
+    assets.add_argument("--download", action="store_true", help="get what is missing or damaged first; asks nothing")
+    assets.set_defaults(command=_assets)
     return parser
 
 
@@ -134,6 +144,22 @@ def _setup_rendering(private: bool) -> int:
     from sb3_cpm.envs.rendering import setup_rendering
 
     return setup_rendering(private=private)
+
+
+def _assets(env_ids: list[str], download: bool) -> int:
+    try:
+        from sb3_cpm.envs import assets, vulkan
+
+        vulkan.activate_private()  # libraries that SAPIEN and OpenCV need
+        if download:
+            for line in assets.download(env_ids):
+                print(line, flush=True)
+        rows = list(assets.report(env_ids))
+    except ImportError as error:
+        raise RuntimeError(f"The tasks need a package that is missing ({error}): pip install 'sb3_cpm[maniskill]'") from error
+    for _, line in rows:
+        print(line)
+    return 0 if all(ready for ready, _ in rows) else 1
 
 
 if __name__ == "__main__":

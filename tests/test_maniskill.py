@@ -58,7 +58,7 @@ for env_id, mode in (("PickSingleYCB-v1", "dense"), ("TurnFaucet-v1", "sparse"),
     try:
         make_maniskill_env(env_id, reward_mode=mode)
     except RuntimeError as error:
-        assert "python -m mani_skill.utils.download_asset" in str(error), error
+        assert f"python -m sb3_cpm assets --download {env_id}" in str(error), error
         print("refused", env_id)
 """
 

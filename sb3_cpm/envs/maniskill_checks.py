@@ -6,9 +6,9 @@ import inspect
 import logging
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_cpm.envs.assets import missing_assets, require_assets
 from sb3_cpm.envs.rendering import Renderer, ensure_renderer, without_renderer
 from sb3_cpm.envs.tasks import register_tasks, registered_name
 
@@ -17,9 +17,6 @@ DEFAULT_ROBOT = "panda_wristcam"
 
 NEEDS_PICTURES = ("OpenCabinetDrawer-v1", "OpenCabinetDoor-v1")
 """Tasks that read where something is from the shapes that are drawn, here the handles: they need a renderer in any mode."""
-
-ASSET_FILES = {"ycb": "info_pick_v0.json"}
-"""A file that a complete download has: ManiSkill itself only asks for the folder, which a failed download leaves behind."""
 
 
 class Task(NamedTuple):
@@ -98,26 +95,22 @@ def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: s
     from mani_skill.utils.registration import REGISTERED_ENVS
 
     register_tasks()
-    env_id = registered_name(env_id, reward_mode)
     if env_id not in REGISTERED_ENVS:
         raise ValueError(f"Unknown task {env_id!r}. {_nearest(env_id, REGISTERED_ENVS)}")
-    spec = REGISTERED_ENVS[env_id]
+    spec = REGISTERED_ENVS[registered_name(env_id, reward_mode)]
     if robot is not None and robot not in REGISTERED_AGENTS:
         raise ValueError(f"Unknown robot {robot!r}. {_nearest(robot, REGISTERED_AGENTS)}")
-    modes = spec.cls.SUPPORTED_REWARD_MODES
+    modes = REGISTERED_ENVS[registered_name(env_id, "dense")].cls.SUPPORTED_REWARD_MODES
     if reward_mode not in modes:
         raise ValueError(f"{env_id} has no reward_mode {reward_mode!r}, it has: {', '.join(modes)}.")
     steps = max_episode_steps or spec.max_episode_steps
     if steps is None:
         raise ValueError(f"{env_id} has no time limit of its own: pass max_episode_steps=...")
-    _check_assets(env_id, spec.asset_download_ids or ())
-
-    known = {name for robots in spec.cls.SUPPORTED_ROBOTS or () for name in ([robots] if isinstance(robots, str) else robots)}
-    if robot is None and known & {"panda", DEFAULT_ROBOT}:
-        robot = DEFAULT_ROBOT
-    task = Task(env_id, robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
+    robot = _choose_robot(env_id, spec.cls.SUPPORTED_ROBOTS, robot)
+    task = Task(spec.uid, robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
     if task.robot in REGISTERED_AGENTS:
         _check_robot(REGISTERED_AGENTS[task.robot].agent_cls, control_mode)
+    require_assets(env_id)
     return task
 
 
@@ -134,42 +127,25 @@ def explained(env_id: str) -> Iterator[None]:
     try:
         yield
     except (FileNotFoundError, EOFError, SystemExit) as error:
-        raise _missing_assets(env_id, str(error)) from error
+        raise missing_assets(env_id, str(error)) from error
     except RuntimeError as error:
         if "download" not in str(error).lower():
             raise
-        raise RuntimeError(f"{env_id} needs files that are not here. ManiSkill says: {error}") from error
+        raise missing_assets(env_id, str(error)) from error
     finally:
         logger.setLevel(level)
 
 
-def _check_assets(env_id: str, asset_ids: Any) -> None:
-    """Like ManiSkill's own check, which however asks on stdin: a prompt that hangs a batch job for ever."""
-    from mani_skill.utils import assets
-
-    missing = []
-    for asset_id in asset_ids:
-        group = asset_id in assets.DATA_GROUPS
-        source_ids = assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else (asset_id,)
-        for source_id in sorted(source_ids):
-            source = assets.DATA_SOURCES[source_id]
-            folder = Path(source.output_dir) / source.target_path
-            empty = folder.is_dir() and not any(folder.iterdir())
-            if empty or not (folder / ASSET_FILES.get(source_id, "")).exists():
-                missing.append(source_id)
-    if missing:
-        names = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
-        raise _missing_assets(env_id, names)
-
-
-def _missing_assets(env_id: str, what: str) -> RuntimeError:
-    from mani_skill import ASSET_DIR
-
-    return RuntimeError(
-        f"{env_id} needs files that are not here or not complete: {what}. They belong into {ASSET_DIR} (the environment "
-        f"variable MS_ASSET_DIR moves that). Download them, after removing incomplete folders, with:\n"
-        f"    python -m mani_skill.utils.download_asset {env_id}"
-    )
+def _choose_robot(env_id: str, supported: Any, robot: str | None) -> str | None:
+    """:return: the robot to ask for, None for the task's own choice (several robots at once, for instance)"""
+    alone = {name for name in supported or () if isinstance(name, str)}
+    if alone & {"panda", DEFAULT_ROBOT}:
+        alone.add(DEFAULT_ROBOT)  # the same arm, with a camera
+    if robot is None:
+        return DEFAULT_ROBOT if DEFAULT_ROBOT in alone else None
+    if supported is not None and robot not in alone:
+        raise ValueError(f"{env_id} is not made for robot {robot!r}. It takes: {', '.join(sorted(alone)) or supported}.")
+    return robot
 
 
 def _check_robot(agent_class: Any, control_mode: str) -> None:

@@ -4,8 +4,8 @@ Light visuals: what a software renderer can draw fast.
 On a CPU, ManiSkill's pictures are slow because of triangles, not pixels: the Panda's hand camera alone has 425,160 of
 them, its links 135,000, the floor 20,000. Light visuals draw coarser meshes of the same colours
 (:mod:`sb3_cpm.envs.meshes`), of the robot as of everything else that comes from a file, and a floor of two triangles.
-Collision shapes, masses, joints and the floor's collision plane are untouched, so the physics stay the same to the last bit. The
-pictures look alike but are not equal: train and evaluate with the same visuals.
+Collision shapes, masses, joints and the floor's collision plane are untouched, so the physics stay the same to the last
+bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
 """
 
 import contextlib
