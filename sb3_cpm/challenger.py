@@ -19,8 +19,11 @@ from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
+from sb3_cpm.uncertainty.ensemble import Ensemble
+from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
 from sb3_cpm.world_model.checkpoint import check_sizes, read_file, write_file
+from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.observations import ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
@@ -77,6 +80,10 @@ class Challenger:
         self.exploration = ActorCritic("exploration", *feat).to(self.device)
         self.task = ActorCritic("task", *feat).to(self.device) if self.preset["train_task_behavior"] else None
         self.optimizers = self._make_optimizers()
+        if self.preset["amp"]:
+            check_mixed_precision(self.device)
+        #: whether torch.compile was asked for and works here
+        self.compiled = self.preset["compile"] and compile_modules(self._hot_modules(), self.device)
 
     def _uncertainty_class(self, kind: str | type[Uncertainty]) -> tuple[str, type[Uncertainty], dict[str, Any]]:
         """Its name in checkpoints, the class, and the preset's arguments for it."""
@@ -99,6 +106,15 @@ class Challenger:
         if self.task is not None:
             optimizers.update(self.task.make_optimizers())
         return optimizers
+
+    def _hot_modules(self) -> list[torch.nn.Module]:
+        """What nearly all of the time goes into; none of it draws random numbers, and none contains another."""
+        model = self.world_model
+        heads = [model.reward_head, *([] if model.continue_head is None else [model.continue_head])]
+        behaviors = [self.exploration, *([] if self.task is None else [self.task])]
+        actors = [part for one in behaviors for part in (one.actor.net, one.critic)]
+        novelty = [part for part in self.uncertainty.modules() if isinstance(part, (Ensemble, MLP))]
+        return [model.encoder, model.decoder, model.rssm, model.rssm.prior_net, *heads, *actors, *novelty]
 
     # ---- acting ------------------------------------------------------------------------------------------------------
 
@@ -208,7 +224,8 @@ class Challenger:
         :raises RuntimeError: if a loss is not finite, naming the term; the parts updated before it keep their update
         """
         sequences = self._to_device(batch)
-        output = self.world_model.loss(sequences)
+        with mixed_precision(self.device, self.preset["amp"]):
+            output = self.world_model.loss(sequences)
         metrics = self._step_world_model(output)
         metrics.update(self._train_uncertainty(sequences, output))
         start = self._imagination_starts(sequences, output)

@@ -53,6 +53,8 @@ REPORT: dict[str, Any] = {
     "imagination_starts": None,  # how many states of a batch imagination starts from, None for all
     "gamma": 0.99,  # discount
     "lambda_": 0.95,  # of the lambda-returns
+    "actor_gradient": "dynamics",  # how actors learn: "dynamics", "reinforce" or "both"
+    "reinforce_share": 0.9,  # share of REINFORCE in "both"
     "entropy_scale": 1e-4,  # reward for the actor's entropy
     "actor_layers": 4,  # hidden layers
     "actor_units": 400,  # size of each of them
@@ -61,6 +63,9 @@ REPORT: dict[str, Any] = {
     "slow_target": True,  # bootstrap from a slow copy of the critic
     "slow_target_every": 100,  # updates between two copies
     "train_task_behavior": False,  # also train an actor-critic for the task; the challenger does not act with it
+    # speed, see sb3_cpm.world_model.acceleration
+    "amp": False,  # train in bfloat16 mixed precision; pays on GPUs
+    "compile": False,  # torch.compile of the hot parts; takes minutes at the start, pays on GPUs
     # constructor arguments of uncertainty classes, by name; `uncertainty_kwargs` come on top
     "uncertainty": {
         "plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "feat", "metric": "exp"},
@@ -102,6 +107,11 @@ PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}
 _POSITIVE_INTEGERS = [
     key for key in REPORT if key.endswith(("_size", "_length", "_units", "_classes", "_every")) or key.startswith("cnn_")
 ] + ["horizon"]
+_CHOICES: dict[str, tuple[Any, ...]] = {
+    "latent": ("gaussian", "categorical"),
+    "actor_gradient": ("dynamics", "reinforce", "both"),
+    **{key: (True, False) for key, value in REPORT.items() if isinstance(value, bool)},
+}
 
 
 def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -> dict[str, Any]:
@@ -110,7 +120,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
 
     :param preset: name of a preset, or the entries that differ from "default"
     :param overrides: further entries, they win
-    :raises ValueError: for unknown names (with the nearest valid one) and sizes that are no positive integers
+    :raises ValueError: for unknown names (with the nearest valid one), sizes that are no positive integers, unknown choices
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
@@ -127,6 +137,11 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     for key in _POSITIVE_INTEGERS:
         if not isinstance(result[key], int) or isinstance(result[key], bool) or result[key] < 1:
             raise ValueError(f"Preset entry {key!r} must be an integer of at least 1, got {result[key]!r}.")
+    for key, valid in _CHOICES.items():
+        if result[key] not in valid:
+            raise ValueError(f"Preset entry {key!r}: `{key}` must be one of {valid}, got {result[key]!r}.")
+    if not 0.0 <= result["reinforce_share"] <= 1.0:
+        raise ValueError(f"Preset entry 'reinforce_share' must lie between 0 and 1, got {result['reinforce_share']!r}.")
     if result["sequence_length"] < 2:
         raise ValueError("Preset entry 'sequence_length' must be at least 2: a transition has two rows.")
     return result

@@ -3,7 +3,15 @@ Actor and critic that learn in imagination (report, B.1; Hafner et al. 2021, sec
 exploration, which differ in nothing but the reward that they are given.
 
 Imagined states have indices 0..H, actions and rewards 0..H-1: action i is taken in state i, reward i is for arriving in state
-i + 1, and so is return i. Gradients of the returns flow back through the learned dynamics into the actions.
+i + 1, and so is return i.
+
+The actor learns in one of three ways (preset entry ``actor_gradient``; Hafner et al. 2021, eq. 6):
+
+* "dynamics": the gradient of the returns flows back through the learned dynamics into the actions. Little variance, and as
+  good as the learned dynamics' slopes are; nothing is learnt from rewards that are flat in between steps.
+* "reinforce": log-probabilities of the actions, weighted with how much better than the critic's expectation they turned out
+  (Williams 1992). Needs no slopes, has more variance, and costs less: nothing is back-propagated through time.
+* "both": a mixture, ``reinforce_share`` of it REINFORCE.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
+from sb3_cpm.world_model.acceleration import mixed_precision
 from sb3_cpm.world_model.distributions import TruncatedNormal
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
@@ -56,7 +65,7 @@ class Actor(nn.Module):
         self.net = MLP(feat_dim, layers, units, 2 * action_dim)
 
     def forward(self, feat: torch.Tensor) -> TruncatedNormal:
-        mean, raw = self.net(feat).chunk(2, dim=-1)
+        mean, raw = self.net(feat).float().chunk(2, dim=-1)
         return TruncatedNormal(torch.tanh(mean), 2.0 * torch.sigmoid(0.5 * raw) + self.min_std)
 
 
@@ -129,17 +138,23 @@ class ActorCritic(nn.Module):
         :param optimizers: those of :meth:`make_optimizers`
         :return: numbers worth logging, detached scalars
         """
-        imagined = self.imagine(world_model, start)
-        rewards = reward(imagined)
-        discounts = self.preset["gamma"] * world_model.continue_probability(imagined.feats[1:])
-        values = self.target_critic(imagined.feats[1:]).squeeze(-1)
-        returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
+        amp = mixed_precision(start.deter.device, self.preset["amp"])
+        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"):
+            with amp:
+                imagined = self.imagine(world_model, start)
+            rewards = reward(imagined)
+            with amp:
+                discounts = self.preset["gamma"] * world_model.continue_probability(imagined.feats[1:])
+                values = self.target_critic(imagined.feats[1:]).float().squeeze(-1)
+            returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
         reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
 
-        actor_loss = -(reached * (returns + self.preset["entropy_scale"] * imagined.entropies)).mean()
+        objective, entropies = self._objective(imagined, returns, values)
+        actor_loss = -(reached * (objective + self.preset["entropy_scale"] * entropies)).mean()
         actor_norm = optimizers[f"{self.name}_actor"].step(actor_loss)
-        predicted = self.critic(imagined.feats[:-1].detach()).squeeze(-1)
+        with amp:
+            predicted = self.critic(imagined.feats[:-1].detach()).float().squeeze(-1)
         critic_loss = (reached * 0.5 * (predicted - returns.detach()).square()).mean()
         critic_norm = optimizers[f"{self.name}_critic"].step(critic_loss)
         self._follow_slowly()
@@ -150,9 +165,34 @@ class ActorCritic(nn.Module):
             "critic_grad_norm": critic_norm,
             "imagined_reward": rewards.mean(),
             "imagined_return": returns.mean(),
-            "entropy": imagined.entropies.mean(),
+            "entropy": entropies.mean(),
         }
         return {f"{self.name}_{key}": value.detach() for key, value in metrics.items()}
+
+    def _objective(
+        self, imagined: Imagination, returns: torch.Tensor, values: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        What the actor climbs, and its entropies, each of shape ``(H, n)``.
+
+        :param imagined: what it did
+        :param returns: of each action, shape ``(H, n)``
+        :param values: of the states 1..H by the slow critic, shape ``(H, n)``
+        """
+        kind = self.preset["actor_gradient"]
+        if kind == "dynamics":
+            return returns, imagined.entropies
+        feats = imagined.feats[:-1].detach()
+        with mixed_precision(feats.device, self.preset["amp"]):
+            policy = self.actor(feats)
+        with torch.no_grad():
+            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))
+            advantage = returns - baseline
+        reinforce = policy.log_prob(imagined.actions.detach()) * advantage
+        if kind == "reinforce":
+            return reinforce, policy.entropy()
+        share = self.preset["reinforce_share"]
+        return share * reinforce + (1.0 - share) * returns, imagined.entropies
 
     def _follow_slowly(self) -> None:
         """Hard copy of the critic into the slow target every ``slow_target_every`` updates."""

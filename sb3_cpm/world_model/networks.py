@@ -54,7 +54,8 @@ class GRUCell(nn.Module):
         self.norm = nn.LayerNorm(3 * size, eps=1e-3)
 
     def forward(self, inputs: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
-        gates = self.norm(self.gates(torch.cat((inputs, hidden), dim=-1)))
+        # float(): does nothing, unless mixed precision is on, whose rounding must not accumulate in the memory
+        gates = self.norm(self.gates(torch.cat((inputs, hidden), dim=-1)).float()).float()
         reset, candidate, update = gates.chunk(3, dim=-1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return torch.lerp(hidden, candidate, torch.sigmoid(update + self.update_bias))

@@ -42,6 +42,10 @@ class Inputs(NamedTuple):
     images: torch.Tensor | None
     vectors: torch.Tensor | None
 
+    def float(self) -> "Inputs":
+        """The same in float32, where mixed precision computed them."""
+        return Inputs(*(None if part is None else part.float() for part in self))
+
 
 class ObservationSpec:
     """

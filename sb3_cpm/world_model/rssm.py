@@ -9,6 +9,7 @@ posterior q(stoch_t | deter_t, embed_t), after seeing state t
 
 ``action_t`` is the action that *led to* state t (see :class:`sb3_cpm.type_aliases.SequenceBatch`). Only what depends on the
 step before is computed step by step; projections of embeddings and actions, and the whole prior, see all steps at once.
+States are float32 even where mixed precision computes them: a memory that is rounded at every step forgets.
 """
 
 from typing import NamedTuple
@@ -73,6 +74,17 @@ class RSSM(nn.Module):
         self.posterior_embed = nn.Linear(embed_dim, hidden_size, bias=False)
         self.posterior_out = nn.Linear(hidden_size, latent.stats_size)
 
+    def forward(self, stoch: torch.Tensor, action_in: torch.Tensor, deter: torch.Tensor) -> torch.Tensor:
+        """
+        One step of the memory, what all sequences are made of (``torch.compile`` takes hold here).
+
+        :param stoch: stochastic state before the step, shape ``(n, stoch_size)``
+        :param action_in: projected action, shape ``(n, hidden_size)``
+        :param deter: memory before the step, shape ``(n, deter_size)``
+        :return: memory after it
+        """
+        return self.gru(F.elu(self.input_stoch(stoch) + action_in), deter)
+
     def initial_state(self, n: int) -> LatentState:
         """Zeros for ``n`` environments."""
         like = self.input_stoch.weight
@@ -107,7 +119,7 @@ class RSSM(nn.Module):
         first = is_first.unsqueeze(-1)
         actions_in = self.input_action(actions.masked_fill(first, 0.0))
         embed_in = self.posterior_embed(embed)
-        noise = None if deterministic else self.latent.noise(length, n, like=embed_in)
+        noise = None if deterministic else self.latent.noise(length, n, like=state.deter)
         resets = is_first.any(dim=1).tolist()
         gaps = None if mask is None else (~mask).any(dim=1).tolist()
 
@@ -117,8 +129,8 @@ class RSSM(nn.Module):
             before = LatentState(deter, stoch, stats)
             if resets[t]:
                 deter, stoch = deter.masked_fill(first[t], 0.0), stoch.masked_fill(first[t], 0.0)
-            deter = self.gru(F.elu(self.input_stoch(stoch) + actions_in[t]), deter)
-            stats = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_in[t]))
+            deter = self(stoch, actions_in[t], deter)
+            stats = self.posterior_out(F.elu(self.posterior_deter(deter) + embed_in[t])).float()
             stoch = self.latent.mode(stats) if noise is None else self.latent.sample(stats, noise[t])
             if mask is not None and gaps is not None and gaps[t]:
                 here = mask[t].unsqueeze(-1)
@@ -130,7 +142,7 @@ class RSSM(nn.Module):
 
     def prior(self, deter: torch.Tensor) -> torch.Tensor:
         """Parameters of the prior that belongs to a deterministic state, shape ``(*batch, stats_size)``."""
-        return self.prior_net(deter)
+        return self.prior_net(deter).float()
 
     def imagine_step(self, state: LatentState, action: torch.Tensor, deterministic: bool = False) -> LatentState:
         """
@@ -141,8 +153,8 @@ class RSSM(nn.Module):
         :param deterministic: take the mode instead of a sample
         :return: the predicted next state
         """
-        deter = self.gru(F.elu(self.input_stoch(state.stoch) + self.input_action(action)), state.deter)
-        stats = self.prior_net(deter)
+        deter = self(state.stoch, self.input_action(action), state.deter)
+        stats = self.prior(deter)
         if deterministic:
             return LatentState(deter, self.latent.mode(stats), stats)
         return LatentState(deter, self.latent.sample(stats, self.latent.noise(len(deter), like=deter)), stats)

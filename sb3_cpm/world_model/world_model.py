@@ -84,7 +84,7 @@ class WorldModel(nn.Module):
     def loss(self, batch: Sequences) -> WorldModelOutput:
         """Everything that one update of the world model minimises, and the posterior states it found on the way."""
         length, n = batch.mask.shape
-        embed = self.encoder(batch.inputs).unflatten(0, (length, n))
+        embed = self.encoder(batch.inputs).float().unflatten(0, (length, n))
         # no mask here: padding follows the last row, so it cannot change a state that counts
         posterior = self.rssm.observe(embed, batch.actions, batch.is_first)
         prior = self.rssm.prior(posterior.deter)
@@ -104,7 +104,7 @@ class WorldModel(nn.Module):
         self, feat: torch.Tensor, batch: Sequences
     ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         losses, metrics = {}, {}
-        decoded = self.decoder(feat.flatten(0, 1))
+        decoded = self.decoder(feat.flatten(0, 1)).float()
         mask = batch.mask.flatten()
         if decoded.images is not None and batch.inputs.images is not None:
             losses["image"] = masked_mean(squared_error(decoded.images, batch.inputs.images), mask)
@@ -118,12 +118,12 @@ class WorldModel(nn.Module):
     def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> dict[str, torch.Tensor]:
         feat_reward = feat if self.preset["reward_gradient"] else feat.detach()
         target = symlog(batch.rewards) if self.preset["symlog_rewards"] else batch.rewards
-        error = squared_error(self.reward_head(feat_reward).squeeze(-1).flatten(), target.flatten())
+        error = squared_error(self.reward_head(feat_reward).float().squeeze(-1).flatten(), target.flatten())
         # nothing was received for arriving in a reset state; its stored 0 is no observation of the reward function
         arrived = (batch.mask & ~batch.is_first).flatten()
         losses = {"reward": self.preset["reward_scale"] * masked_mean(error, arrived)}
         if self.continue_head is not None:
-            logits = self.continue_head(feat).squeeze(-1)
+            logits = self.continue_head(feat).float().squeeze(-1)
             goes_on = (~batch.is_terminal).to(logits.dtype)
             entropy = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="none")
             losses["continue"] = self.preset["continue_scale"] * masked_mean(entropy, batch.mask)
@@ -131,14 +131,14 @@ class WorldModel(nn.Module):
 
     def reward(self, feat: torch.Tensor) -> torch.Tensor:
         """Predicted reward for arriving in a state, shape ``(*batch,)``."""
-        prediction = self.reward_head(feat).squeeze(-1)
+        prediction = self.reward_head(feat).float().squeeze(-1)
         return symexp(prediction) if self.preset["symlog_rewards"] else prediction
 
     def continue_probability(self, feat: torch.Tensor) -> torch.Tensor:
         """Predicted probability that the episode does not terminate in a state, shape ``(*batch,)``."""
         if self.continue_head is None:
             return torch.ones_like(feat[..., 0])
-        return torch.sigmoid(self.continue_head(feat).squeeze(-1))
+        return torch.sigmoid(self.continue_head(feat).float().squeeze(-1))
 
     def kl(self, state: LatentState) -> torch.Tensor:
         """

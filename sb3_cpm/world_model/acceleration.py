@@ -1,0 +1,72 @@
+"""
+Two switches for speed, both off by default: mixed precision (preset entry ``amp``) and ``torch.compile`` (``compile``).
+
+Mixed precision runs the matrix products and convolutions of training in bfloat16, whose range is float32's, so that no loss
+has to be scaled. Everything that adds up small differences stays in float32: weights and optimizers, recurrent and stochastic
+state, all losses, the KL, and novelty altogether, since heads that agree to three digits would agree completely in bfloat16.
+Acting and judging episodes stay in float32 as well; they cost little, and their numbers become rewards.
+"""
+
+import contextlib
+import functools
+import warnings
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+
+import torch
+from torch import nn
+
+
+def mixed_precision(device: torch.device, enabled: bool) -> AbstractContextManager:
+    """
+    Context in which matrix products and convolutions run in bfloat16. Leave it before weights change: it keeps their casts.
+
+    :param device: where they run
+    :param enabled: False for a context that does nothing
+    """
+    return torch.autocast(device.type, dtype=torch.bfloat16) if enabled else contextlib.nullcontext()
+
+
+def check_mixed_precision(device: torch.device) -> None:
+    """
+    :raises ValueError: if the device cannot compute in bfloat16
+    """
+    if device.type == "cuda" and not torch.cuda.is_bf16_supported():
+        raise ValueError(
+            f"amp=True needs bfloat16, which {torch.cuda.get_device_name(device)} does not have (Ampere and later do). "
+            "Leave `amp` off."
+        )
+
+
+def compile_modules(modules: Iterable[nn.Module], device: torch.device) -> bool:
+    """
+    Compile modules in place: their weights keep their names, and what calls them does not change. The first call of each
+    then takes seconds to minutes. Where nothing can be compiled they stay as they are, with a warning that says why.
+
+    :param modules: what to compile; their ``forward`` must be free of random numbers
+    :param device: where they run
+    :return: whether they were compiled
+    """
+    reason = why_not_compile(device.type)
+    if reason:
+        warnings.warn(
+            f"compile=True has no effect, torch.compile does not work here ({reason}). Install a C++ compiler (for example "
+            "g++) and Python's headers; on a GPU also Triton. Everything runs as without `compile`.",
+            UserWarning,
+            stacklevel=3,
+        )
+        return False
+    for module in modules:
+        module.compile()
+    return True
+
+
+@functools.cache
+def why_not_compile(device_type: str) -> str:
+    """:return: the error of compiling something small on such a device, empty if that works; tried once per process"""
+    try:
+        probe = torch.compile(lambda x: torch.tanh(x) * 2.0 + 1.0)
+        probe(torch.zeros(8, device=device_type))
+    except Exception as error:  # dynamo and inductor wrap whatever fails, from a missing g++ to an unsupported Python
+        return f"{type(error).__name__}: {str(error).strip().splitlines()[0][:200] if str(error).strip() else 'no message'}"
+    return ""
