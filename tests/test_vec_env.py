@@ -266,7 +266,7 @@ def test_a_stale_grasp_is_not_seen_at_the_start() -> None:
 
 def test_sb3_trains_with_several_environments() -> None:
     env = VecNormalize(VecCheckNan(fake(num_envs=4), raise_exception=True), norm_obs_keys=["state"])
-    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=16, n_epochs=1, device="cpu", policy_kwargs=SMALL)
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=16, n_epochs=1, device="cpu", policy_kwargs={**SMALL})
     model.learn(64)
     assert len(model.ep_info_buffer or []) == 4 * (64 // 4 // 6)
 

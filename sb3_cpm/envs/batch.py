@@ -69,6 +69,8 @@ class ManiSkillBatch:
         self.ignore_terminations = ignore_terminations
         self.episode_seeds = np.zeros(self.num_envs, dtype=np.int64)
         self.state_layout: dict[str, slice] = {}
+        self.shows_goal = False
+        self.goal: Any = None  # a goal view wants to know where things are, see `sb3_cpm.envs.goals`
         self._visuals = visuals
         self._labels = np.zeros((self.num_envs, 1), dtype=np.int16)
         self.cameras = self._choose_cameras(cameras) if obs_mode == "visual" else ()
@@ -76,6 +78,7 @@ class ManiSkillBatch:
         self.action_space: spaces.Box = self.env.single_action_space
         # ManiSkill rendered once while it was built; that observation has every key, so the spaces need no second render
         raw = obs_tools.to_host(self._select(self.env._last_obs))
+        self.shows_goal = obs_tools.find_goal(raw["extra"]) is not None
         self._last = self._observe(raw, np.arange(self.num_envs), np.zeros(self.num_envs, dtype=np.int64))
         self.observation_space = _space(self._last)
         self._grasps: dict[str, np.ndarray] = {}  # what the grippers feel, by the task's names
@@ -130,7 +133,10 @@ class ManiSkillBatch:
         # not in place: the arrays of the last step belong to whoever took that step
         last = {key: value.copy() for key, value in self._last.items()}
         for key, value in observations.items():
-            last[key][rows] = value
+            if key in last:
+                last[key][rows] = value
+            else:
+                last[key] = np.zeros((self.num_envs, *value.shape[1:]), dtype=value.dtype)
         self._last = last
         return observations, self._infos(host["info"], len(rows))
 
@@ -202,6 +208,8 @@ class ManiSkillBatch:
                 }
             else:
                 tree[f"camera {name}"] = {"rgb": sensor["rgb"]}
+        if self.goal is not None:
+            tree["goal"] = self.goal.positions(self.env)
         if self.cameras and self.cloud.n_points:
             robot = self.env.agent
             if self.cloud.frame == "base":
@@ -231,6 +239,8 @@ class ManiSkillBatch:
         if not self.state_layout:
             self.state_layout = obs_tools.layout(parts)
         observations["state"] = obs_tools.join_parts(parts, len(rows))
+        for key, place in host.get("goal", {}).items():
+            observations[key] = place.astype(np.float32)
         return observations
 
     def _infos(self, info: Mapping[str, np.ndarray], n: int) -> list[dict[str, Any]]:
