@@ -22,9 +22,10 @@ from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.uncertainty.ensemble import Ensemble
 from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
-from sb3_cpm.world_model.checkpoint import check_sizes, read_file, write_file
+from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, read_file, write_file
 from sb3_cpm.world_model.networks import MLP
-from sb3_cpm.world_model.observations import ObservationSpec, check_action_space, to_tensor
+from sb3_cpm.world_model.observations import UINT8_RANGE, ObservationSpec, check_action_space, to_tensor
+from sb3_cpm.world_model.open_loop import OpenLoop, open_loop
 from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import Sequences, WorldModel, WorldModelOutput
@@ -36,7 +37,7 @@ class Challenger:
     """
     World model, uncertainty and exploration behaviour, with everything that trains them.
 
-    :param observation_space: Dict space; images (3-D uint8) and vectors (1-D) are read
+    :param observation_space: Dict space; images (3-D, of uint8 or with finite bounds) and vectors (1-D) are read
     :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
     :param device: "auto" takes the GPU where there is one
     :param preset: "default", "report", or a dict of entries, see :mod:`sb3_cpm.presets`
@@ -201,6 +202,21 @@ class Challenger:
         assert not self.uncertainty.nonnegative or bool((novelty >= 0.0).all()), "disagreement below zero"
         return Evaluation(novelty.float().cpu().numpy(), kl.clamp(min=0.0).cpu().numpy(), embed.cpu().numpy())
 
+    def open_loop(self, observations: Mapping[str, Array], actions: Array, context: int) -> OpenLoop:
+        """
+        What the world model believes it would see in an episode of which it is shown the first states only.
+
+        :param observations: of the states 0..T, or of the context only, per key of shape ``(rows, *observation_shape)``
+        :param actions: action ``t`` was taken in state ``t``, shape ``(T, action_dim)``, within [-1, 1]
+        :param context: how many states it is shown, at least 1
+        :raises ValueError: if there are fewer states than that
+        """
+        taken = self._tensor(actions).view(-1, self.action_dim)
+        rows = min(len(observations[self.keys[0]]), len(taken) + 1)
+        if not 1 <= context <= rows:
+            raise ValueError(f"`context` must lie between 1 and the episode's {rows} states, got {context}.")
+        return open_loop(self.world_model, self.spec.preprocess(observations, self.device), taken, context)
+
     def _transitions(self, posterior: LatentState, actions: torch.Tensor, embed: torch.Tensor) -> Transitions:
         """
         Transitions between consecutive rows. State t is paired with the action in row t + 1, which was taken in it.
@@ -218,6 +234,9 @@ class Challenger:
     def train(self, batch: SequenceBatch) -> dict[str, float]:
         """
         One update of everything: world model, uncertainty, exploration behaviour (and task behaviour if the preset asks).
+
+        Sequences longer than any episode are fine: they run on into the next episode (``is_first`` resets the state there),
+        and where nothing follows they are padded, with ``mask`` False. Padding has no influence on anything.
 
         :param batch: sequences; its arrays are not changed
         :return: losses and other numbers worth logging
@@ -343,7 +362,10 @@ class Challenger:
 
         :param path: of the file
         :param include_rng: also torch's global random state
+        :raises RuntimeError: if a weight is not finite; the last good file is kept then
         """
+        for name, network in self.networks.items():
+            check_finite(path, name, network.state_dict())
         write_file(path, {"config": self._config(), "state": self.state_dict(include_rng)})
 
     def load_state(self, path: str | os.PathLike, restore_rng: bool = False) -> None:
@@ -362,7 +384,12 @@ class Challenger:
 
     def _config(self) -> dict[str, Any]:
         """Plain data only: files are read without executing anything in them."""
-        keys = {key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys}
+        keys: dict[str, dict[str, Any]] = {
+            key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys
+        }
+        for key, limits in self.spec.ranges.items():
+            if limits != UINT8_RANGE:
+                keys[key]["range"] = list(limits)
         action = {"low": self.action_space.low.tolist(), "high": self.action_space.high.tolist()}
         return {
             "keys": keys,
@@ -409,6 +436,9 @@ class Challenger:
 
 
 def _space(entry: Mapping[str, Any]) -> spaces.Box:
+    if "range" in entry:
+        low, high = entry["range"]
+        return spaces.Box(low, high, tuple(entry["shape"]), np.float32)
     if entry["image"]:
         return spaces.Box(0, 255, tuple(entry["shape"]), np.uint8)
     return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)
@@ -416,6 +446,13 @@ def _space(entry: Mapping[str, Any]) -> spaces.Box:
 
 def choose_device(device: torch.device | str) -> torch.device:
     """SB3's choice, but an explicit GPU that is not there is an error instead of a silent CPU."""
-    if str(device).startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"Device {str(device)!r} was asked for, but torch sees no GPU. Use device='auto' or 'cpu'.")
+    try:
+        wanted = torch.device("cpu" if device == "auto" else device)
+    except RuntimeError as error:
+        raise ValueError(f"Unknown device {str(device)!r}: use 'auto', 'cpu', 'cuda' or 'cuda:1'.") from error
+    if wanted.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ValueError(f"Device {str(device)!r} was asked for, but torch sees no GPU. Use device='auto' or 'cpu'.")
+        if (wanted.index or 0) >= torch.cuda.device_count():
+            raise ValueError(f"Device {str(device)!r} was asked for, but torch sees {torch.cuda.device_count()} GPU(s) only.")
     return get_device(device)

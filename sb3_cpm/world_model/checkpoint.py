@@ -50,6 +50,17 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     return content
 
 
+def check_finite(path: str | os.PathLike, name: str, weights: Mapping[str, Any]) -> None:
+    """
+    :raises RuntimeError: naming the first weight that is not finite: a file with it would only replace a better one
+    """
+    for key, value in weights.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            raise RuntimeError(
+                f"The challenger is not saved: its weight {name}.{key} is not finite. If {path} exists, it is kept as it was."
+            )
+
+
 def check_sizes(name: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
     """
     :raises ValueError: naming the first weight that is missing, unknown or of another shape

@@ -4,7 +4,8 @@ What of a Dict observation space the world model reads, and how it enters the ne
 Images are stacked on their channels and scaled to [-0.5, 0.5]; vectors are concatenated and squashed with ``symlog``.
 """
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,8 +52,9 @@ class ObservationSpec:
     """
     The observation keys that the world model reads, sorted by kind.
 
-    An *image* is a 3-D uint8 Box, channel-last ``(H, W, C)`` or channel-first ``(C, H, W)`` (the channels are the
-    smallest dimension, as in SB3); a *vector* is a 1-D Box. A point cloud (2-D float Box) is read only when ``keys``
+    An *image* is a 3-D Box, channel-last ``(H, W, C)`` or channel-first ``(C, H, W)`` (the channels are the smallest
+    dimension, as in SB3), of uint8 or with finite bounds, which then say what is black and what is white; a *vector* is a 1-D
+    Box. A point cloud (2-D float Box) is read only when ``keys``
     names it; it is then flattened to one long vector.
 
     :param observation_space: Dict space as SB3's VecEnv gives it
@@ -73,6 +75,9 @@ class ObservationSpec:
         self.vector_keys = tuple(key for key in chosen if key not in self.image_keys)
         self.keys = self.image_keys + self.vector_keys
         self.shapes: dict[str, tuple[int, ...]] = {key: tuple(observation_space[key].shape or ()) for key in self.keys}
+        #: values that become -0.5 and 0.5, for every image
+        self.ranges = {key: image_range(observation_space[key]) or UINT8_RANGE for key in self.image_keys}
+        self.scaled_alike = set(self.ranges.values()) == {UINT8_RANGE}
         self.image_shape = self._image_shape()
         self.vector_sizes = [int(np.prod(self.shapes[key])) for key in self.vector_keys]
         self.vector_dim = sum(self.vector_sizes)
@@ -83,19 +88,24 @@ class ObservationSpec:
             chosen = [key for key, sub in space.items() if is_image(sub) or is_vector(sub)]
             if not chosen:
                 raise ValueError(
-                    "No observation key is usable by the challenger: it reads images (3-D uint8 Box) and vectors (1-D "
-                    f"Box), the space has { {key: str(sub) for key, sub in space.items()} }. A point cloud is read if "
-                    "`keys` names it."
+                    "No observation key is usable by the challenger: it reads images (3-D Box of uint8 or with finite bounds) "
+                    f"and vectors (1-D Box), the space has { {key: str(sub) for key, sub in space.items()} }. A point cloud "
+                    "is read if `keys` names it."
                 )
+            for key, sub in space.items():
+                if is_rangeless_image(sub):
+                    warnings.warn(f"The challenger leaves out {key!r}: {RANGELESS.format(key=key, space=sub)}", stacklevel=4)
             return chosen
         if isinstance(keys, str) or not keys:
             raise ValueError(f"`keys` must be a non-empty list of observation keys, got {keys!r}.")
         for key in keys:
             if key not in space.spaces:
                 raise ValueError(f"Unknown observation key {key!r}, the space has {sorted(space.spaces)}.")
+            if is_rangeless_image(space[key]):
+                raise ValueError(f"The challenger cannot read key {key!r}: {RANGELESS.format(key=key, space=space[key])}")
             if not (is_image(space[key]) or is_vector(space[key]) or is_cloud(space[key])):
                 raise ValueError(
-                    f"The challenger cannot read key {key!r}: {space[key]} is no image (3-D uint8 Box), no vector (1-D Box) "
+                    f"The challenger cannot read key {key!r}: {space[key]} is no image (3-D Box), no vector (1-D Box) "
                     "and no point cloud (2-D float Box). Leave it out of `keys`."
                 )
         return list(dict.fromkeys(keys))
@@ -135,11 +145,10 @@ class ObservationSpec:
         images = vectors = None
         if self.image_keys:
             # (n, H, W, C) all along: seen as (n, C, H, W) that is PyTorch's channels-last format, fast in convolutions
-            stacked = [
-                tensors[key].permute(0, 2, 3, 1) if self._channel_first(key) else tensors[key] for key in self.image_keys
-            ]
+            stacked = [self.channels_last(key, self._scaled(key, tensors[key])) for key in self.image_keys]
             joined = torch.cat(stacked, dim=-1) if len(stacked) > 1 else stacked[0].contiguous()
-            images = joined.permute(0, 3, 1, 2).float().div_(255.0).sub_(0.5)
+            images = joined.permute(0, 3, 1, 2).float()
+            images = images.div_(255.0).sub_(0.5) if self.scaled_alike else images
         if self.vector_keys:
             vectors = torch.cat([tensors[key].flatten(1).float() for key in self.vector_keys], dim=-1)
             if self.squash:
@@ -158,11 +167,51 @@ class ObservationSpec:
                 f"Observation {key!r} has shape {tuple(tensor.shape)}, expected it to end in {shape}: the observation space "
                 "is not the one that the challenger was built for."
             )
+        if key in self.ranges and self.ranges[key] == UINT8_RANGE and tensor.dtype != torch.uint8:
+            raise ValueError(
+                f"Image {key!r} came as {tensor.dtype}, its space declares uint8 from 0 to 255. Has a wrapper scaled it? "
+                "Leave the image as it is (the player has normalize_images), or declare what the wrapper returns."
+            )
         return tensor.reshape(-1, *shape)
+
+    def _scaled(self, key: str, image: torch.Tensor) -> torch.Tensor:
+        """An image in [-0.5, 0.5], or untouched where all are uint8 and can be scaled at once."""
+        if self.scaled_alike:
+            return image
+        low, high = self.ranges[key]
+        if image.dtype != torch.uint8 and not (image.amin() >= low and image.amax() <= high):  # in this form NaN is caught too
+            raise ValueError(
+                f"Image {key!r} holds values from {image.amin():.4g} to {image.amax():.4g}, its space declares {low:g} to "
+                f"{high:g}. Correct the space's bounds, or clip the image in a wrapper."
+            )
+        return (image.float() - low) / (high - low) - 0.5
+
+    def channels_last(self, key: str, images: torch.Tensor) -> torch.Tensor:
+        """
+        :param key: an image key
+        :param images: as the space has them, shape ``(*batch, *observation_shape)``
+        :return: shape ``(*batch, height, width, channels)``
+        """
+        return images.movedim(-3, -1) if self._channel_first(key) else images
+
+    def errors(self, decoded: Inputs, truth: Inputs) -> Iterator[tuple[str, torch.Tensor]]:
+        """
+        Mean absolute error of every key, shape ``(n,)``: of images on the scale of [-0.5, 0.5], of vectors as they enter the
+        networks (after ``symlog``).
+
+        :param decoded: what the world model drew
+        :param truth: what it should have drawn
+        """
+        if decoded.images is not None and truth.images is not None:
+            parts = (decoded.images - truth.images).abs().mean((2, 3)).split(self.channels, dim=1)
+            yield from zip(self.image_keys, (part.mean(1) for part in parts), strict=True)
+        if decoded.vectors is not None and truth.vectors is not None:
+            parts = (decoded.vectors - truth.vectors).abs().split(self.vector_sizes, dim=1)
+            yield from zip(self.vector_keys, (part.mean(1) for part in parts), strict=True)
 
     def split(self, inputs: Inputs, batch: Sequence[int]) -> dict[str, torch.Tensor]:
         """
-        The inverse of :meth:`preprocess`, for decoded observations: one float tensor per key, images in [0, 255].
+        The inverse of :meth:`preprocess`, for decoded observations: one float tensor per key, images in their space's range.
 
         :param inputs: preprocessed (or decoded) observations of ``prod(batch)`` states
         :param batch: the batch dimensions to restore
@@ -170,8 +219,10 @@ class ObservationSpec:
         """
         result = {}
         if inputs.images is not None:
-            cameras = torch.split((inputs.images + 0.5).clamp(0.0, 1.0) * 255.0, self.channels, dim=1)
+            cameras = torch.split((inputs.images + 0.5).clamp(0.0, 1.0), self.channels, dim=1)
             for key, camera in zip(self.image_keys, cameras, strict=True):
+                low, high = self.ranges[key]
+                camera = camera * (high - low) + low
                 camera = camera if self._channel_first(key) else camera.permute(0, 2, 3, 1)
                 result[key] = camera.reshape(*batch, *self.shapes[key])
         if inputs.vectors is not None:
@@ -181,9 +232,35 @@ class ObservationSpec:
         return result
 
 
+UINT8_RANGE = (0.0, 255.0)
+GREATEST_RANGE = 2.0**32  # bounds wider than that (the limits of float32, say) tell nothing about an image
+RANGELESS = (
+    "{space} looks like an image, but has no finite bounds, so nothing says what is black and what is white. Let the "
+    "environment return uint8, or declare the bounds, as Box(0.0, 1.0, shape), with gymnasium's TransformObservation."
+)
+
+
 def is_image(space: spaces.Space) -> bool:
-    """3-D uint8 Box."""
-    return isinstance(space, spaces.Box) and len(space.shape) == 3 and space.dtype == np.uint8
+    """3-D Box of uint8 or with finite bounds."""
+    return is_3d(space) and image_range(space) is not None
+
+
+def is_3d(space: spaces.Space) -> bool:
+    return isinstance(space, spaces.Box) and len(space.shape) == 3
+
+
+def is_rangeless_image(space: spaces.Space) -> bool:
+    """3-D Box of other numbers than uint8, without finite bounds."""
+    return is_3d(space) and image_range(space) is None
+
+
+def image_range(space: spaces.Space) -> tuple[float, float] | None:
+    """Smallest and greatest value of a 3-D Box; None where it has no bounds, or none that leave room for an image."""
+    assert isinstance(space, spaces.Box)
+    if space.dtype == np.uint8:
+        return UINT8_RANGE
+    low, high = float(space.low.min()), float(space.high.max())
+    return (low, high) if 0.0 < high - low <= GREATEST_RANGE else None
 
 
 def is_vector(space: spaces.Space) -> bool:

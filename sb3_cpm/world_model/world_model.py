@@ -113,6 +113,8 @@ class WorldModel(nn.Module):
                 metrics["pixel_error"] = masked_mean(error, mask)
         if decoded.vectors is not None and batch.inputs.vectors is not None:
             losses["vector"] = masked_mean(squared_error(decoded.vectors, batch.inputs.vectors), mask)
+        with torch.no_grad():
+            metrics.update({f"error_{key}": masked_mean(one, mask) for key, one in self.spec.errors(decoded, batch.inputs)})
         return losses, metrics
 
     def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> dict[str, torch.Tensor]:
