@@ -8,8 +8,13 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm import ChallengerCallback
 from sb3_cpm.buffers import EXECUTED_ACTION, CPMBuffer
 from sb3_cpm.type_aliases import Evaluation
 
@@ -463,3 +468,35 @@ def test_degenerate_episodes_have_documented_outcomes(rewards, length):
     assert proposal is None or (not proposal.accepted and not proposal.verdicts["not_first"])
     assert np.isfinite([value for name, value in buffer.coefficients.items()]).all() and not buffer.challenges
     assert buffer.sample(10).rewards.unique().tolist() == [rewards]
+
+
+TINY = dict(
+    batch_size=4, sequence_length=12, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=16, hidden_size=16, head_units=16,
+    actor_units=16, critic_units=16, horizon=4, imagination_starts=8,
+)  # fmt: skip
+
+
+def test_the_callback_refreshes_and_logs_it(tmp_path):
+    env = make_vec_env("sb3_cpm.envs.toy:CPMToy-v0", seed=0, env_kwargs=dict(keys=("state",)))
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=CPMBuffer,
+        replay_buffer_kwargs=dict(refresh_every=100, filter_kwargs=LENIENT, storage_dtypes={"state": "float16"}),
+        learning_starts=100,
+        batch_size=16,
+        buffer_size=2000,
+        seed=0,
+        device="cpu",
+        policy_kwargs=dict(net_arch=[16]),
+    )
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(600, callback=ChallengerCallback(train_freq=10, challenger_kwargs=TINY), log_interval=1)
+    model.logger.close()
+    buffer = model.replay_buffer
+    assert buffer.counters.refreshed > 0
+    assert all(challenge.age < 100 + 50 for challenge in buffer.challenges)
+    lines = (tmp_path / "progress.csv").read_text().splitlines()
+    columns = dict(zip(lines[0].split(","), zip(*(line.split(",") for line in lines[1:]), strict=True), strict=True))
+    changes, ages = columns["challenge/refresh_change"], columns["challenge/sampled_age"]
+    assert any(float(change) > 0 for change in changes if change) and any(0 <= float(age) < 200 for age in ages if age)

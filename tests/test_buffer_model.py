@@ -84,7 +84,13 @@ class Machine(RuleBasedStateMachine):
 
     # ------------------------------------------------------------------ what can happen
 
-    @rule(ends=st.lists(st.sampled_from(["no", "no", "no", "terminated", "truncated"]), min_size=3, max_size=3))
+    @rule(seed=st.integers(0, 10**6), n_steps=st.integers(1, 15), end_probability=st.sampled_from([0.05, 0.2, 0.5]))
+    def play(self, seed, n_steps, end_probability):
+        rng = np.random.default_rng(seed)
+        for _ in range(n_steps):
+            ended = rng.random(3) < end_probability
+            self.add(np.where(ended, rng.choice(["terminated", "truncated"], 3), "no").tolist())
+
     def add(self, ends):
         ends = [
             "truncated" if episode.length + 1 >= self.size and end == "no" else end
@@ -259,4 +265,4 @@ class Machine(RuleBasedStateMachine):
 
 
 TestMachine = Machine.TestCase
-TestMachine.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)
+TestMachine.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
