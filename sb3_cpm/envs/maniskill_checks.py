@@ -157,10 +157,11 @@ def _check_robot(agent_class: Any, control_mode: str) -> None:
             f"The files of robot {agent_class.uid!r} are missing: {format_path(path)}. Download them with:\n"
             f"    python -m mani_skill.utils.download_asset {agent_class.uid}"
         )
+    # the names of the controllers need no simulated robot, only names of joints and links, which some robots set when they are
+    # made; where a robot needs more, ManiSkill will complain itself
+    unmade = type("Unmade", (agent_class,), {"__getattr__": lambda robot, name: None})
     try:
-        # the table of controllers needs only class attributes for nearly all robots; where it needs a simulated robot,
-        # ManiSkill will complain itself
-        controllers = list(agent_class._controller_configs.fget(object.__new__(agent_class)))
+        controllers = list(agent_class._controller_configs.fget(object.__new__(unmade)))
     except Exception:
         return
     if control_mode not in controllers:
