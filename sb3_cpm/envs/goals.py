@@ -103,7 +103,7 @@ class _View:
         :param achieved_goal: metres, shape ``(..., axes)``
         :param desired_goal: metres, shape ``(..., axes)``
         :param info: not needed
-        :return: 0 where the goal is reached, else -1 (``"sparse"``); minus the distance in metres (``"dense"``); shape ``(...)``
+        :return: 0 where the goal is reached, else -1 (``"sparse"``); minus the metres between (``"dense"``); shape ``(...)``
         """
         distance = self.distance(achieved_goal, desired_goal)
         return -distance if self.dense else -(distance > self.goal.threshold).astype(np.float32)
@@ -112,8 +112,8 @@ class _View:
 class GoalView(gym.Wrapper[Any, Any, Any, Any]):
     """
     A ManiSkill task as a goal environment: ``observation`` (what the robot knows of itself, without the goal),
-    ``achieved_goal`` (where the object is; **privileged**), ``desired_goal`` (where it should be), and cameras and cloud where the task was made
-    with them. Rewards are those of :meth:`compute_reward`.
+    ``achieved_goal`` (where the object is; **privileged**), ``desired_goal`` (where it should be), and
+    cameras and cloud where the task was made with them. Rewards are those of :meth:`compute_reward`.
 
     Episodes end by time only. ``is_success`` is still the task's own, which may want more than a place (PickCube: that the
     robot rests); ``goal_reached`` says that the object is there.
@@ -147,7 +147,7 @@ class GoalView(gym.Wrapper[Any, Any, Any, Any]):
         :param achieved_goal: metres, shape ``(..., 3)``
         :param desired_goal: metres, shape ``(..., 3)``
         :param info: not needed
-        :return: 0 where the goal is reached, else -1 (``"sparse"``); minus the distance in metres (``"dense"``); shape ``(...)``
+        :return: 0 where the goal is reached, else -1 (``"sparse"``); minus the metres between (``"dense"``); shape ``(...)``
         """
         return self._view.compute_reward(achieved_goal, desired_goal)
 

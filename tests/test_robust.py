@@ -1,0 +1,203 @@
+"""Worker processes that die, hang or grow: the training goes on."""
+
+import os
+import signal
+import time
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.envs.robust import RobustSubprocVecEnv
+
+
+class Mortal(gym.Wrapper):
+    """An environment that knows its process, and can be told to fail."""
+
+    def __init__(self, env: gym.Env, limit: int = 50):
+        super().__init__(env)
+        self.pid = os.getpid()
+        self.marker = "none"
+        self.limit = limit
+        self.steps = 0
+
+    def behave(self, how: str) -> None:
+        self.marker = how
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        if self.marker == "raise":
+            raise RuntimeError("a mistake in the environment")
+        if self.marker == "hang":
+            time.sleep(60)
+        self.steps += 1
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated or self.steps >= self.limit, info
+
+
+def make(limit: int = 50, how: str = "none") -> gym.Env:
+    import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0, also in the worker)
+
+    env = Mortal(gym.make("CPMToy-v0", keys=("state",)), limit)
+    env.behave(how)
+    return Monitor(env)
+
+
+robust = partial(RobustSubprocVecEnv, start_method="fork")  # starts fastest, and is the hardest: brothers hold copies of pipes
+
+
+# what Python 3.12 says about fork; the workers use no threads of the parent
+pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+
+ACTIONS = np.full((2, 2), 0.5, dtype=np.float32)
+
+
+def kill(env: RobustSubprocVecEnv, i: int) -> None:
+    os.kill(env.get_attr("pid", i)[0], signal.SIGKILL)
+
+
+def test_the_same_as_sb3_while_nothing_happens() -> None:
+    frames = []
+    for kind in (SubprocVecEnv, RobustSubprocVecEnv):
+        env = kind([partial(make, 3)] * 2, start_method="fork")
+        env.seed(5)
+        steps: list[Any] = [env.reset()]
+        for _ in range(7):
+            observations, rewards, dones, infos = env.step(ACTIONS)
+            steps.append(
+                (observations, rewards.tolist(), dones.tolist(), [info.get("terminal_observation") for info in infos])
+            )
+        frames.append(str(steps))
+        assert env.get_attr("limit") == [3, 3] and env.has_attr("pid") and env.env_is_wrapped(Mortal) == [True, True]
+        env.close()
+    assert frames[0] == frames[1]
+
+
+@pytest.mark.parametrize("start_method", ["forkserver", "fork"])
+def test_a_dead_worker_costs_one_episode(start_method: str) -> None:
+    env = RobustSubprocVecEnv([make] * 2, start_method=start_method)
+    env.seed(1)
+    env.reset()
+    env.set_attr("marker", "kept")
+    before, _, _, _ = env.step(ACTIONS)
+    kill(env, 1)
+    with pytest.warns(UserWarning, match="Worker 1 died with exit code -9: a new one takes its place"):
+        observations, rewards, dones, infos = env.step(ACTIONS)
+    assert dones.tolist() == [False, True] and rewards[1] == 0 and rewards[0] != 0
+    assert infos[1]["TimeLimit.truncated"] is True and "exit code -9" in infos[1]["worker_died"]
+    np.testing.assert_array_equal(infos[1]["terminal_observation"]["state"], before["state"][1])  # type: ignore
+    assert (observations["state"][1] != before["state"][1]).any()  # type: ignore[call-overload,index]
+    assert env.restarts == [0, 1] and env.get_attr("marker") == ["kept", "kept"]
+    # everything goes on, and whatever else is asked for
+    assert not env.step(ACTIONS)[2].any()
+    asks: list[Any] = [lambda: env.get_attr("limit"), env.reset, lambda: env.env_method("get_wrapper_attr", "limit")]
+    for ask in asks if start_method == "fork" else []:
+        kill(env, 0)
+        with pytest.warns(UserWarning, match="Worker 0 died"):
+            result = ask()
+        assert len(result) == (1 if isinstance(result, dict) else 2)
+        for _ in range(50):  # a whole episode, else three deaths in a row would be too many
+            _, _, dones, infos = env.step(ACTIONS)
+        assert "episode" in infos[0]
+    env.close()
+
+
+def test_a_worker_that_hangs() -> None:
+    env = robust([make] * 2, timeout=4)
+    env.reset()
+    env.env_method("behave", "hang", indices=[0])
+    with pytest.warns(UserWarning, match="Worker 0 gave no answer for 4 s"):
+        _, _, dones, _ = env.step(ACTIONS)
+    assert dones.tolist() == [True, False]
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:Worker 0 died")
+def test_a_mistake_is_not_repeated_for_ever() -> None:
+    env = robust([partial(make, how="raise")])
+    env.reset()
+    env.step(ACTIONS[:1]), env.step(ACTIONS[:1])
+    with pytest.raises(RuntimeError, match="3 deaths without a finished episode"):
+        env.step(ACTIONS[:1])
+    env.close()
+
+
+def broken() -> gym.Env:
+    raise RuntimeError("no such task")
+
+
+def test_an_environment_that_cannot_be_made() -> None:
+    with pytest.raises(RuntimeError, match="died while it made its environment"):
+        robust([broken])
+
+
+def test_workers_are_replaced_after_some_episodes() -> None:
+    env = robust([partial(make, 2), partial(make, 5)], episodes_per_worker=2)
+    env.seed(0)
+    env.reset()
+    pids, starts = [env.get_attr("pid")], set()
+    for step in range(1, 9):
+        observations, _, dones, infos = env.step(ACTIONS)
+        assert dones.tolist() == [step % 2 == 0, step % 5 == 0]  # no episode is cut
+        assert ["episode" in info for info in infos] == dones.tolist()
+        if dones[0]:
+            starts.add(observations["state"][0].tobytes())  # type: ignore[call-overload,index]
+            pids.append(env.get_attr("pid"))
+    first = [pid for pid, _ in pids]
+    assert first[0] == first[1] != first[2] == first[3] != first[4] and len(starts) == 4
+    assert len({pid for _, pid in pids}) == 1 and env.restarts == [0, 0]
+    env.close()
+
+
+@pytest.mark.parametrize("kwargs", [{"episodes_per_worker": 0}, {"timeout": 0.0}])
+def test_numbers_of_no_use(kwargs: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(kwargs))} must be"):
+        robust([make], **kwargs)
+
+
+class Killer(BaseCallback):
+    """Kills a worker in the middle of an episode, twice."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps in (120, 260):
+            kill(self.training_env.unwrapped, 1)  # type: ignore[arg-type]
+        return True
+
+
+@pytest.mark.filterwarnings("ignore:Worker 1 died")
+def test_the_whole_method_survives_the_death_of_a_worker() -> None:
+    env = robust([make] * 2)
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        replay_buffer_class=CPMBuffer,
+        buffer_size=2000,
+        learning_starts=110,
+        train_freq=8,
+        batch_size=16,
+        policy_kwargs={"net_arch": [16]},
+        device="cpu",
+        seed=0,
+    )
+    preset = {"batch_size": 2, "sequence_length": 5}
+    challenger = ChallengerCallback(preset=preset, train_freq=50)
+    model.learn(400, callback=[challenger, Killer()])
+    assert model.num_timesteps == 400 and env.restarts == [0, 2]
+    buffer: Any = model.replay_buffer
+    # worker 0: four whole episodes; worker 1: cut where it was killed, after 60 and 130 steps
+    lengths = [(episode.env_idx, episode.length) for episode in buffer.episodes]
+    assert [length for i, length in lengths if i == 0] == [50, 50, 50, 50]
+    assert [length for i, length in lengths if i == 1] == [50, 11, 50, 20, 50]
+    assert np.isfinite(buffer.sample(64, env=None).rewards.numpy()).all()
+    env.close()
