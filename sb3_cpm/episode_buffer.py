@@ -291,7 +291,10 @@ class EpisodeBuffer(HerReplayBuffer):
             )
 
     def _uniform_transitions(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """:return: slots and environments of n transitions of complete episodes, with replacement, each shape ``(n,)``"""
+        """
+        :return: slots (negative ones count back from the end of the ring) and environments of n transitions of complete
+            episodes, with replacement, each shape ``(n,)``
+        """
         if n == 0:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         ends = self._valid_ends
@@ -303,7 +306,6 @@ class EpisodeBuffer(HerReplayBuffer):
             envs = ends.searchsorted(picks, side="right")
             # oldest + (pick - ends of the environment before)
             rows = picks + (self._current_ep_start - ends).take(envs)
-        rows[rows < 0] += self.buffer_size
         return rows, envs
 
     def _read(
