@@ -19,6 +19,7 @@ EPILOG = """examples:
   python -m sb3_cpm train --env CPMToy-v0 --steps 3000          a small task that needs no renderer
   python -m sb3_cpm train --env Pendulum-v1 --algorithm td3     any gymnasium task with continuous actions
   python -m sb3_cpm train --env-kwargs image_size=64 cameras=[base_camera]
+  python -m sb3_cpm watch runs/PickCube-v1-sac-seed0            what the world model of a run believes it will see
 """
 CHOICES = {"algorithm": ALGORITHMS, "unit": ("step", "segment", "episode")}
 TYPES = {"steps": int, "gamma": float, "tau": float, "buffer_size": int, "learning_starts": int}
@@ -59,6 +60,19 @@ def make_parser() -> argparse.ArgumentParser:
     documentation = field_documentation()
     for setting in fields(TrainSettings):
         _add_option(train, setting, documentation[setting.name].replace("%", "%%"))
+
+    watch = commands.add_parser(
+        "watch",
+        help="draw what the world model of a run believes it will see",
+        description="Show episodes of a run's replay buffer to its challenger for a few frames, and draw what it imagines "
+        "from there on beside the truth: film strips, animations, errors, KL, novelty. Writes RUN_FOLDER/watch.",
+    )
+    watch.add_argument("run_folder", metavar="RUN_FOLDER", help="of a run that has ended")
+    watch.add_argument("--episodes", type=int, default=2, help="episodes, spread over the replay buffer (default: 2)")
+    watch.add_argument("--context", type=int, default=5, help="states that the model is shown at first (default: 5)")
+    watch.add_argument("--frames", type=int, default=50, help="states in all, at most 64 (default: 50)")
+    watch.add_argument("--device", default="auto", help="PyTorch device (default: auto)")
+    watch.set_defaults(command=_watch)
 
     doctor = commands.add_parser("doctor", help="what works on this machine, and the cure for what doesn't")
     doctor.set_defaults(command=_doctor)
@@ -131,6 +145,17 @@ def _train(**settings: Any) -> int:
     except ImportError as error:
         raise RuntimeError(f'Training needs a package that is missing ({error}): pip install "sb3_cpm[run]"') from error
     train(TrainSettings(**settings))
+    return 0
+
+
+def _watch(**arguments: Any) -> int:
+    try:
+        from sb3_cpm.run.watch import watch
+    except ImportError as error:
+        raise RuntimeError(f'Watching needs a package that is missing ({error}): pip install "sb3_cpm[run]"') from error
+    watched = watch(**arguments)
+    print(watched.text)
+    print("\nDrawn: " + ", ".join(str(file) for file in watched.files))
     return 0
 
 
