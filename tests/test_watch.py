@@ -7,14 +7,16 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from challenger_helpers import BOTH, VECTOR, random_batch, small
+from challenger_helpers import BOTH, VECTOR, random_batch, small, weights
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cpm.__main__ import main
+from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.run import train
+from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run.watch import watch
+from sb3_cpm.run.watch_callback import WatchCallback
 
 RUN: dict[str, Any] = {
     "env": "CPMToy-v0",
@@ -116,6 +118,35 @@ def test_the_command_draws_everything(finished: Path, capsys: pytest.CaptureFixt
     for name in ("reconstruction_error_camera", "open_loop_error_state", "kl", "disagreement", "exp_scale"):
         assert f"watch/{name}" in scalars
     main(["watch", str(finished), "--frames", "16", "--episodes", "1"])  # once more: files are replaced
+
+
+class Watching(WatchCallback):
+    """In a run the challenger's callback is made inside; find it when training starts."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(ChallengerCallback(), **kwargs)
+
+    def _on_training_start(self) -> None:
+        callbacks = self.locals["callback"].callbacks
+        self.challenger = next(one for one in callbacks if isinstance(one, ChallengerCallback))
+
+
+def test_watching_while_it_learns(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "watched"
+    train(TrainSettings(run_folder=str(folder), **RUN), callback=Watching(every=60, frames=16))
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    videos = events.Images("watch/open_loop")
+    assert len(videos) >= 2 and videos[-1].encoded_image_string[:3] == b"GIF"
+    assert {"watch/open_loop_error_camera", "challenger/error_camera"} <= set(events.Tags()["scalars"])
+    unwatched, watched = (Challenger.load(path / "challenger.pt", "cpu") for path in (finished, folder))
+    assert all(np.array_equal(value, weights(watched)[key]) for key, value in weights(unwatched).items()), "the same run"
+
+
+@pytest.mark.parametrize("kwargs", [{"every": 0}, {"context": 0}, {"frames": 65}])
+def test_wrong_arguments_of_the_callback(kwargs: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        WatchCallback(ChallengerCallback(), **kwargs)
 
 
 def test_states_alone_are_drawn_as_curves(tmp_path: Path) -> None:

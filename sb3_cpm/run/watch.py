@@ -10,7 +10,7 @@ These are episodes that the model may have learnt from; errors on new ones are h
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -89,12 +89,19 @@ def watch(run_folder: str | Path, episodes: int = 2, context: int = 5, frames: i
     folder = Path(run_folder)
     if episodes < 1:
         raise ValueError(f"episodes={episodes}: expected 1 or more")
-    if not 1 <= context < frames <= MOST_FRAMES:
-        raise ValueError(f"context={context}, frames={frames}: expected 1 <= context < frames <= {MOST_FRAMES}")
+    check_frames(context, frames)
     challenger, buffer = _load(folder, device)
     chosen = _choose(buffer.episodes, episodes, context)
-    dreams = [_dream(challenger, buffer, episode, context, frames) for episode in chosen]
+    dreams = [dream_of(challenger, buffer, episode, context, frames) for episode in chosen]
     return Watched(_write(folder, challenger, dreams), _describe(folder, challenger, dreams))
+
+
+def check_frames(context: int, frames: int) -> None:
+    """
+    :raises ValueError: unless there is something to see and something to imagine
+    """
+    if not 1 <= context < frames <= MOST_FRAMES:
+        raise ValueError(f"context={context}, frames={frames}: expected 1 <= context < frames <= {MOST_FRAMES}")
 
 
 def _load(folder: Path, device: str) -> tuple[Challenger, CPMBuffer]:
@@ -126,7 +133,14 @@ def _choose(episodes: Sequence[Episode], wanted: int, context: int) -> list[Epis
     return [long_enough[place] for place in places]
 
 
-def _dream(challenger: Challenger, buffer: CPMBuffer, episode: Episode, context: int, frames: int) -> Dream:
+def dream_of(challenger: Challenger, buffer: CPMBuffer, episode: Episode, context: int, frames: int) -> Dream:
+    """
+    :param challenger: who dreams
+    :param buffer: where the episode is
+    :param episode: of at least ``context`` transitions
+    :param context: states that the model is shown at first
+    :param frames: states in all
+    """
     rows = min(frames, episode.length + 1)
     observations = {key: value[:rows] for key, value in buffer.episode_observations(episode, challenger.keys).items()}
     actions = buffer.episode_actions(episode)[: rows - 1]
@@ -187,34 +201,53 @@ def _title(folder: Path, challenger: Challenger) -> str:
 
 def _log(folder: Path, challenger: Challenger, dreams: Sequence[Dream], files: Sequence[Path]) -> None:
     """Pictures, animations and numbers to TensorBoard, at the challenger's number of updates."""
-    from tensorboard.compat.proto.summary_pb2 import Summary
     from torch.utils.tensorboard import SummaryWriter
 
     step = challenger.trained_updates
     with SummaryWriter(str(folder)) as writer:
-        for name, value in _numbers(challenger, dreams).items():
+        for name, value in numbers(challenger, dreams).items():
             writer.add_scalar(f"watch/{name}", value, step)
-        for file in files:  # TensorBoard plays an animated GIF where it expects a picture; add_video would need moviepy
-            picture = Summary.Image(encoded_image_string=file.read_bytes(), colorspace=3)
-            summary = Summary(value=[Summary.Value(tag=f"watch/{file.name}", image=picture)])
-            writer._get_file_writer().add_summary(summary, step)
+        for file in files:
+            _log_picture(writer, f"watch/{file.name}", file.read_bytes(), step)
 
 
-def _numbers(challenger: Challenger, dreams: Sequence[Dream]) -> dict[str, float]:
-    numbers = {}
+def log_animation(writer: Any, tag: str, dream: Dream, step: int) -> None:
+    """
+    :param writer: TensorBoard's
+    :param tag: how TensorBoard shall call it
+    :param dream: an episode with images
+    :param step: when
+    """
+    _log_picture(writer, tag, pictures.animation(dream), step)
+
+
+def _log_picture(writer: Any, tag: str, content: bytes, step: int) -> None:
+    """TensorBoard plays an animated GIF where it expects a picture; its ``add_video`` would need moviepy."""
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    picture = Summary.Image(encoded_image_string=content, colorspace=3)
+    writer._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
+
+
+def numbers(challenger: Challenger, dreams: Sequence[Dream]) -> dict[str, float]:
+    """
+    :param challenger: who dreamt
+    :param dreams: episodes
+    :return: mean absolute errors per key (seen, imagined, of standing still), KL, novelty and its scale
+    """
+    found = {}
     for key in challenger.keys:
-        errors, still = ([getattr(dream, name)(key) for dream in dreams] for name in ("errors", "errors_of_standing_still"))
-        contexts = [dream.context for dream in dreams]
-        numbers[f"reconstruction_error_{key}"] = _mean([one[:c] for one, c in zip(errors, contexts, strict=True)])
-        numbers[f"open_loop_error_{key}"] = _mean([one[c:] for one, c in zip(errors, contexts, strict=True)])
-        numbers[f"standing_still_error_{key}"] = _mean([one[c:] for one, c in zip(still, contexts, strict=True)])
-    numbers["open_loop_error_reward"] = _mean(
+        errors = [(dream.errors(key), dream.errors_of_standing_still(key), dream.context) for dream in dreams]
+        found[f"reconstruction_error_{key}"] = _mean([model[:context] for model, _, context in errors])
+        found[f"open_loop_error_{key}"] = _mean([model[context:] for model, _, context in errors])
+        found[f"standing_still_error_{key}"] = _mean([still[context:] for _, still, context in errors])
+    found["open_loop_error_reward"] = _mean(
         [np.abs(dream.rewards - dream.drawn_rewards)[dream.context - 1 :] for dream in dreams]
     )
-    numbers["kl"] = _mean([dream.opinion.kl for dream in dreams])
-    numbers["disagreement"] = _mean([dream.opinion.disagreement for dream in dreams])
+    found["kl"] = _mean([dream.opinion.kl for dream in dreams])
+    found["disagreement"] = _mean([dream.opinion.disagreement for dream in dreams])
     scale = getattr(challenger.uncertainty, "k", None)
-    return numbers if scale is None else {**numbers, "exp_scale": float(scale)}
+    return found if scale is None else {**found, "exp_scale": float(scale)}
 
 
 def _mean(parts: Sequence[np.ndarray]) -> float:
@@ -223,7 +256,7 @@ def _mean(parts: Sequence[np.ndarray]) -> float:
 
 
 def _describe(folder: Path, challenger: Challenger, dreams: Sequence[Dream]) -> str:
-    numbers = _numbers(challenger, dreams)
+    found = numbers(challenger, dreams)
     rows = ", ".join(str(len(dream.drawn_rewards) + 1) for dream in dreams)
     lines = [
         f"{_title(folder, challenger)}: {len(dreams)} episode(s) of {rows} states, {dreams[0].context} of them shown",
@@ -232,8 +265,8 @@ def _describe(folder: Path, challenger: Challenger, dreams: Sequence[Dream]) -> 
     ]
     for key in challenger.keys:
         kinds = ("reconstruction", "open_loop", "standing_still")
-        seen, imagined, still = (numbers[f"{kind}_error_{key}"] for kind in kinds)
+        seen, imagined, still = (found[f"{kind}_error_{key}"] for kind in kinds)
         lines.append(f"{key:<22}{seen:>10.4f}{imagined:>10.4f}{still:>16.4f}")
-    lines.append(f"{'reward':<22}{'':>10}{numbers['open_loop_error_reward']:>10.4f}")
-    lines += ["", f"KL {numbers['kl']:.2f} nats, disagreement {numbers['disagreement']:.2f} (mean over all steps)"]
+    lines.append(f"{'reward':<22}{'':>10}{found['open_loop_error_reward']:>10.4f}")
+    lines += ["", f"KL {found['kl']:.2f} nats, disagreement {found['disagreement']:.2f} (mean over all steps)"]
     return "\n".join(lines)
