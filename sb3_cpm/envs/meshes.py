@@ -1,5 +1,5 @@
 """
-A mesh for people turned into one for a software renderer: the same shape and colours with a twentieth of the triangles.
+A mesh for people turned into one for a software renderer: the same shape and colours with a few of its triangles.
 
 The original is read by SAPIEN itself, so any file that can be drawn can be made light (glTF, Collada, STL, OBJ, with textures
 or without), and what comes out is what SAPIEN would have drawn, only coarser. It is made once and kept in the cache folder
@@ -20,19 +20,19 @@ from sb3_cpm.envs import vulkan
 FORMAT = 1
 """Part of the cache's key: raise it when the result changes."""
 
-KEEP = 1000
+KEEP = 600
 """Files with at most so many triangles stay as they are, textures and all."""
 
-SHARE = 0.05
+SHARE = 0.03
 """Share of the triangles that stays, within the next two limits; at 32 to 128 pixels nobody sees the others."""
-FEWEST, MOST = 300, 1500
+FEWEST, MOST = 300, 1000
 """Triangles of one part."""
 
 SMALL = 0.15
 """Metres; a part of at most this size may be drawn as its convex hull."""
 
-SMOOTH = 0.7
-"""Cosine of the angle (45 degrees) up to which neighbouring triangles look like one surface."""
+SMOOTH = 0.5
+"""Cosine of the angle (60 degrees) up to which neighbouring triangles look like one surface."""
 
 SAMPLES = 40_000
 """Points of the original's surface, from which the colours of a textured mesh are taken."""
@@ -117,14 +117,16 @@ def _light_part(part: Any) -> Part:
 
 def _decimate(full: Any) -> Any:
     import fast_simplification  # noqa: F401  (trimesh needs it, and says so too late)
+    import trimesh
 
     wanted = int(min(MOST, max(FEWEST, SHARE * len(full.faces))))
     if len(full.faces) <= wanted:
         return full
     light = full.simplify_quadric_decimation(face_count=wanted)
     if len(light.faces) > 2 * wanted and max(full.extents) < SMALL:
-        # a hand camera's screws and lenses: a thousand separate parts resist decimation
-        light = full.convex_hull.simplify_quadric_decimation(face_count=FEWEST)
+        # a hand camera's screws and lenses: a thousand separate parts resist decimation; so do the round edges of its hull
+        grid = max(full.extents) / 32
+        light = trimesh.convex.convex_hull(np.unique(np.round(full.convex_hull.vertices / grid), axis=0) * grid)
     return light if len(light.faces) > 0 else full
 
 
