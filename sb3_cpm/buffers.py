@@ -258,8 +258,8 @@ class CPMBuffer(EpisodeBuffer):
         D's share, uniform over all transitions of complete episodes, the hindsight part of them relabelled; then I's,
         uniform over all transitions of all challenges.
         """
-        rows, envs = self._uniform_transitions(n_original)
         n_virtual = int(self.her_ratio * n_original)
+        rows, envs = self._uniform_transitions(n_original, n_virtual)
         if not n_imaginary:
             return self._read(rows, envs, n_virtual, env)
         imaginary_rows, imaginary_envs, rewards, is_goal = self._imaginary.sample(n_imaginary, self.n_added)

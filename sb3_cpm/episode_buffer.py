@@ -280,7 +280,8 @@ class EpisodeBuffer(HerReplayBuffer):
         :raises RuntimeError: before the end of the first episode
         """
         self._check_can_sample()
-        return self._read(*self._uniform_transitions(batch_size), int(self.her_ratio * batch_size), env)
+        n_virtual = int(self.her_ratio * batch_size)
+        return self._read(*self._uniform_transitions(batch_size, n_virtual), n_virtual, env)
 
     def _check_can_sample(self) -> None:
         if not self.episodes_ended:
@@ -290,8 +291,10 @@ class EpisodeBuffer(HerReplayBuffer):
                 "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit)."
             )
 
-    def _uniform_transitions(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+    def _uniform_transitions(self, n: int, n_virtual: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """
+        :param n: number of transitions
+        :param n_virtual: the first so many are for hindsight
         :return: slots (negative ones count back from the end of the ring) and environments of n transitions of complete
             episodes, with replacement, each shape ``(n,)``
         """
@@ -299,6 +302,9 @@ class EpisodeBuffer(HerReplayBuffer):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         ends = self._valid_ends
         picks = np.random.randint(ends[-1], size=n)
+        # In the order of memory, reading a large ring takes a seventh less time; the order within a batch means nothing.
+        picks[:n_virtual].sort()
+        picks[n_virtual:].sort()
         if self.n_envs == 1:
             envs = np.zeros(n, dtype=np.int64)
             rows = picks + (self._current_ep_start[0] - ends[0])
