@@ -150,7 +150,8 @@ def test_state_takes_only_what_a_robot_may_know() -> None:
     assert observations.join_parts({}, 3).shape == (3, 0)
 
 
-def test_to_host_copies_everything_in_one_block(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("block", [False, True])
+def test_to_host_copies_everything_from_a_gpu_in_one_block(monkeypatch: pytest.MonkeyPatch, block: bool) -> None:
     live = th.arange(6, dtype=th.float32).reshape(2, 3)
     tree = {
         "flag": th.tensor([True, False]),
@@ -158,11 +159,13 @@ def test_to_host_copies_everything_in_one_block(monkeypatch: pytest.MonkeyPatch)
         "strided": live.T[:2],
         "array": np.array([3, 4]),
     }
-    transfers = []
+    if block:  # as from a GPU
+        monkeypatch.setattr(observations, "_on_host", lambda leaf: False)
+    transfers: list[int] = []
     to_cpu = th.Tensor.cpu
     monkeypatch.setattr(th.Tensor, "cpu", lambda tensor: (transfers.append(1), to_cpu(tensor))[1])
     host = observations.to_host(tree)
-    assert len(transfers) == 1 and list(host) == list(tree) and list(host["deep"]) == list(tree["deep"])
+    assert len(transfers) == block and list(host) == list(tree) and list(host["deep"]) == list(tree["deep"])
     expected: dict[str, Callable] = {"flag": lambda t: t["flag"], "strided": lambda t: t["strided"]}
     for read in (*expected.values(), *(lambda t, k=k: t["deep"][k] for k in tree["deep"])):
         result = read(host)

@@ -32,6 +32,13 @@ from sb3_cpm.extractors import PointNetPolicy
 Tree = dict[str, np.ndarray]
 
 
+@pytest.fixture(params=["host", "device"])
+def where(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the tensors of the stand-in for what they are, and for those of a GPU."""
+    if request.param == "device":
+        monkeypatch.setattr("sb3_cpm.envs.observations._on_host", lambda leaf: False)
+
+
 def fake(num_envs: int = 3, limit: int = 6, n_points: int = 20, **kwargs: Any) -> ManiSkillVecEnv:
     arguments: dict[str, Any] = {
         "cameras": ["camera"],
@@ -74,6 +81,7 @@ def test_spaces_hold_the_observations_of_one() -> None:
     assert inner(env)._sensors == {"camera": None}  # the other one is not rendered
 
 
+@pytest.mark.usefixtures("where")
 def test_what_was_given_away_never_changes() -> None:
     env = fake()
     given: list[Any] = [env.reset()]
@@ -84,6 +92,7 @@ def test_what_was_given_away_never_changes() -> None:
     assert str(given) == str(pickle.loads(kept))
 
 
+@pytest.mark.usefixtures("where")
 def test_an_episode_ends_alone_with_its_true_last_observation() -> None:
     env = fake(limit=8)
     env.seed(1)
@@ -160,6 +169,7 @@ def test_seeds_rule_the_whole_run() -> None:
 
 
 def test_one_copy_to_the_host_per_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_cpm.envs.observations._on_host", lambda leaf: False)
     env = fake(limit=5)
     env.reset()
     transfers: list[int] = []
@@ -189,6 +199,7 @@ def test_members_are_reached_one_by_one() -> None:
     assert env.env_is_wrapped(Monitor) == [True] * 3 and env.env_is_wrapped(gym.wrappers.TimeLimit, [0]) == [False]
 
 
+@pytest.mark.usefixtures("where")
 def test_stored_states_start_the_environments_they_are_meant_for() -> None:
     actions = np.random.default_rng(1).uniform(-1, 1, (6, 3, 2)).astype(np.float32)
     env = fake(limit=20)

@@ -6,6 +6,7 @@ colour of a point is the pixel's colour, its position is the pixel's position (m
 it belongs to is the pixel's segmentation id. N is the number of environments throughout.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -95,26 +96,29 @@ def scene_points(pictures: Sequence[Picture], labels: np.ndarray, max_distance: 
         points, owner = _camera_points(picture, labels, max_distance)
         parts.append(points)
         owners.append(owner)
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return np.concatenate(parts)[order], owner[order]
+    points, owner = np.concatenate(parts), np.concatenate(owners)
+    if len(labels) > 1:
+        order = np.argsort(owner, kind="stable")
+        points, owner = points[order], owner[order]
+    return points, owner
 
 
 def _camera_points(picture: Picture, labels: np.ndarray, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
     n_envs, n_ids = labels.shape
     ids = np.minimum(picture.segmentation.reshape(n_envs, -1), n_ids - 1)
-    found = labels.take(ids + n_ids * np.arange(n_envs)[:, None])
-    owner, pixel = np.nonzero(found != BACKGROUND)  # few are left: what follows costs next to nothing
-    local = picture.position.reshape(n_envs, -1, 3)[owner, pixel].astype(np.float32) * np.float32(1e-3)
-    near = np.einsum("ni,ni->n", local, local) <= max_distance**2
-    owner, pixel, local = owner[near], pixel[near], local[near]
+    found = labels.take(ids + n_ids * np.arange(n_envs)[:, None]).reshape(-1)
+    pixel = np.flatnonzero(found != BACKGROUND)  # few are left: what follows costs next to nothing
+    local = picture.position.reshape(-1, 3).take(pixel, axis=0) * np.float32(1e-3)
+    near = np.flatnonzero(np.einsum("ni,ni->n", local, local) <= max_distance**2)
+    if len(near) < len(pixel):
+        pixel, local = pixel[near], local[near]
+    owner = pixel // ids.shape[1]
 
     points = np.empty((len(owner), POINT_FEATURES + 1), dtype=np.float32)
     rotation, translation = picture.cam2world[:, :3, :3], picture.cam2world[:, :3, 3]
     points[:, :3] = np.einsum("nij,nj->ni", rotation[owner], local) + translation[owner]
-    points[:, 3:6] = picture.rgb.reshape(n_envs, -1, 3)[owner, pixel]
-    points[:, 3:6] /= 255
-    points[:, 6] = found[owner, pixel]
+    np.divide(picture.rgb.reshape(-1, 3).take(pixel, axis=0), np.float32(255), out=points[:, 3:6])
+    points[:, 6] = found.take(pixel)
     return points, owner
 
 
@@ -191,16 +195,21 @@ def goal_clouds(goal: np.ndarray, n_points: int, radius: float = GOAL_RADIUS) ->
     :param radius: metres
     :return: shape ``(N, n_points, 7)``, float32, label :data:`GOAL`
     """
+    clouds = np.empty((len(goal), n_points, POINT_FEATURES + 1), dtype=np.float32)
+    clouds[:, :, :3] = goal[:, None] + radius * _lattice(n_points)
+    clouds[:, :, 3:6] = GOAL_COLOR
+    clouds[:, :, 6] = GOAL
+    return clouds
+
+
+@functools.cache
+def _lattice(n_points: int) -> np.ndarray:
+    """Points on the unit sphere, shape ``(n_points, 3)``."""
     index = np.arange(n_points) + 0.5
     height = 1 - 2 * index / max(n_points, 1)  # uniform in height is uniform on a sphere
     angle = np.pi * (1 + 5**0.5) * index
     ring = np.sqrt(1 - height**2)
-    lattice = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-    clouds = np.empty((len(goal), n_points, POINT_FEATURES + 1), dtype=np.float32)
-    clouds[:, :, :3] = goal[:, None] + radius * lattice
-    clouds[:, :, 3:6] = GOAL_COLOR
-    clouds[:, :, 6] = GOAL
-    return clouds
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
 
 
 def to_frame(clouds: np.ndarray, pose: np.ndarray) -> None:

@@ -75,8 +75,8 @@ def layout(parts: Mapping[str, np.ndarray]) -> dict[str, slice]:
 # ---------------------------------------------------------------------- to the host
 def to_host(tree: Mapping[str, Any], rows: th.Tensor | None = None) -> dict[str, Any]:
     """
-    Copy a tree of tensors to NumPy arrays. All of it travels in one block: with a simulation on the GPU every separate copy
-    would wait for the device once more. The arrays never share memory with the simulator, which reuses its own.
+    Copy a tree of tensors to NumPy arrays. What is on a GPU travels in one block: every separate copy would wait for the
+    device once more. The arrays never share memory with the simulator, which reuses its own.
 
     :param tree: nested dicts of tensors, arrays or numbers, first axis N
     :param rows: only these environments
@@ -85,19 +85,31 @@ def to_host(tree: Mapping[str, Any], rows: th.Tensor | None = None) -> dict[str,
     leaves: dict[tuple[str, ...], th.Tensor] = {}
     _collect(tree, (), leaves, rows)
     result: dict[str, Any] = _skeleton(tree)
-    for device in {leaf.device for leaf in leaves.values()}:  # one, unless a task mixes them
+    for path, leaf in leaves.items():
+        if _on_host(leaf):
+            _put(result, path, leaf.numpy().copy())
+    remote = {path: leaf for path, leaf in leaves.items() if not _on_host(leaf)}
+    if remote:
         # the widest type first, so that every part of the block begins at a multiple of its own item size
-        paths = sorted((path for path in leaves if leaves[path].device == device), key=lambda p: -leaves[p].element_size())
-        block = th.cat([leaves[path].contiguous().reshape(-1).view(th.uint8) for path in paths]).cpu().numpy()
+        paths = sorted(remote, key=lambda path: -remote[path].element_size())
+        block = th.cat([remote[path].contiguous().reshape(-1).view(th.uint8) for path in paths]).cpu().numpy()
         start = 0
         for path in paths:
-            leaf, branch = leaves[path], result
+            leaf = remote[path]
             end = start + leaf.numel() * leaf.element_size()
-            for key in path[:-1]:
-                branch = branch[key]
-            branch[path[-1]] = block[start:end].view(_numpy_type(leaf.dtype)).reshape(leaf.shape)
+            _put(result, path, block[start:end].view(_numpy_type(leaf.dtype)).reshape(leaf.shape))
             start = end
     return result
+
+
+def _on_host(leaf: th.Tensor) -> bool:
+    return leaf.device.type == "cpu"
+
+
+def _put(tree: dict[str, Any], path: tuple[str, ...], value: np.ndarray) -> None:
+    for key in path[:-1]:
+        tree = tree[key]
+    tree[path[-1]] = value
 
 
 def _collect(tree: Mapping[str, Any], path: tuple[str, ...], leaves: dict[tuple[str, ...], th.Tensor], rows: Any) -> None:
