@@ -45,9 +45,7 @@ def main() -> None:
             walls[name].append(wall)
             cpus[name].append(cpu)
 
-    print(
-        f"| Pendulum-v1, {args.steps} steps, {args.threads} thread(s) | steps per second | CPU ms per step | wall clock / SAC |"
-    )
+    print(f"| Pendulum-v1, {args.steps} steps, {args.threads} thread(s) | steps/s | CPU ms per step | wall clock / SAC |")
     print("| --- | --- | --- | --- |")
     for name in walls:
         ratio = statistics.median(ours / sac for ours, sac in zip(walls[name], walls["SAC"], strict=True))

@@ -16,8 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cpm import allocation
-from sb3_cpm.buffers import CPMBuffer, Demonstration
+from sb3_cpm.buffers import CPMBuffer, Demonstration, allocation
 from sb3_cpm.type_aliases import Evaluation
 
 SPACE = spaces.Dict(
@@ -205,7 +204,7 @@ def test_more_than_the_machine_has_is_refused_before_it_is_taken(monkeypatch, tm
 
 
 def test_it_says_how_much_memory_it_will_take(caplog, monkeypatch):
-    with caplog.at_level("INFO", logger="sb3_cpm.allocation"):
+    with caplog.at_level("INFO", logger="sb3_cpm.buffers.allocation"):
         make(size=1000)
     assert "CPMBuffer of 1,000 transitions will take" in caplog.text and "picture" in caplog.text
     assert caplog.records[0].levelname == "INFO"

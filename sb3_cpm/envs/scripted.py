@@ -48,7 +48,7 @@ class PickCubeController:
             self.closing += 1
             target, gripper = cube, CLOSED
         else:
-            self.above = self.above or np.linalg.norm(hand[:2] - cube[:2]) < 0.01
+            self.above = self.above or bool(np.linalg.norm(hand[:2] - cube[:2]) < 0.01)
             target, gripper = cube + np.array([0, 0, 0 if self.above else 0.08]), OPEN
         move = np.clip((target - hand) / REACH, -1, 1)
         return np.concatenate([move, np.zeros(self.n_rotations), [gripper]]).astype(np.float32)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from sb3_cpm.storage import ObservationRing
+from sb3_cpm.buffers.storage import ObservationRing
 from sb3_cpm.type_aliases import SequenceBatch
 
 

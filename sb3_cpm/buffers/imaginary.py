@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sb3_cpm.buffers.storage import Episode
 from sb3_cpm.challenges import CRITERIA, Proposal
-from sb3_cpm.storage import Episode
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,6 @@ The original buffer D and the imaginary buffer I as one SB3 replay buffer (repor
 D is a ``HerReplayBuffer`` that stores every observation once and samples in time independent of its size. I holds
 *challenges*: views into D (environment, start, goal) with rewards of their own. Demonstrations, beyond the report, are a
 part of D that is never overwritten.
-
-==================  ==================================================
-``episode_buffer``  D: episodes, sampling, hindsight, saving
-``storage``         its ring of observations
-``compact``         how a key is stored, ``allocation``: where
-``sequences``       sequences for the world model
-``imaginary``       I
-``demonstrations``  reading recorded trajectories
-==================  ==================================================
 """
 
 from collections.abc import Sequence
@@ -26,18 +17,16 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
-from sb3_cpm.buffer_checks import check_arguments
+from sb3_cpm.buffers.checks import check_arguments
+from sb3_cpm.buffers.compact import StorageSpec
+from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
+from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
+from sb3_cpm.buffers.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
+from sb3_cpm.buffers.sequences import side_by_side
+from sb3_cpm.buffers.storage import Episode
 from sb3_cpm.challenges import ChallengeCurator, Proposal
-from sb3_cpm.compact import StorageSpec
-from sb3_cpm.demonstrations import Demonstration, as_transitions, read_demonstrations
-from sb3_cpm.episode_buffer import EpisodeBuffer
-from sb3_cpm.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
-from sb3_cpm.sequences import side_by_side
 from sb3_cpm.stopwatch import Stopwatch
-from sb3_cpm.storage import Episode
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
-
-__all__ = ["EXECUTED_ACTION", "CPMBuffer", "Challenge", "ChallengeCounters", "Demonstration", "Episode"]
 
 #: Key of ``infos[i]`` under which the exploration wrapper tells the action, within [-1, 1], that was really executed.
 EXECUTED_ACTION = "cpm_executed_action"
@@ -270,8 +259,8 @@ class CPMBuffer(EpisodeBuffer):
 
     def sample_sequences(self, batch_size: int, length: int, keys: Sequence[str] | None = None) -> SequenceBatch:
         """
-        As :meth:`EpisodeBuffer.sample_sequences <sb3_cpm.episode_buffer.EpisodeBuffer.sample_sequences>`; each sequence comes
-        from the demonstrations with probability ``demonstration_ratio``.
+        As :meth:`~sb3_cpm.buffers.episode_buffer.EpisodeBuffer.sample_sequences`; each
+        sequence comes from the demonstrations with probability ``demonstration_ratio``.
 
         :param batch_size: number of sequences
         :param length: rows per sequence

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_cpm.allocation import Allocate
-from sb3_cpm.compact import Codec
+from sb3_cpm.buffers.allocation import Allocate
+from sb3_cpm.buffers.compact import Codec
 
 
 @dataclass(frozen=True)

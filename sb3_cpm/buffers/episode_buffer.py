@@ -29,11 +29,11 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
-from sb3_cpm.allocation import InFolder, check_space, in_memory
-from sb3_cpm.buffer_checks import check_environment, check_spaces, checked_rewards, unreadable
-from sb3_cpm.compact import StorageSpec, make_codecs
-from sb3_cpm.sequences import draw_starts, read_sequences
-from sb3_cpm.storage import Episode, NextObservationView, ObservationRing, Transitions
+from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
+from sb3_cpm.buffers.checks import check_environment, check_spaces, checked_rewards, unreadable
+from sb3_cpm.buffers.compact import StorageSpec, make_codecs
+from sb3_cpm.buffers.sequences import draw_starts, read_sequences
+from sb3_cpm.buffers.storage import Episode, NextObservationView, ObservationRing, Transitions
 from sb3_cpm.type_aliases import SequenceBatch
 
 #: Changes whenever a pickled buffer of an earlier release could be misread.
