@@ -157,6 +157,19 @@ def test_seeds_rule_the_whole_run() -> None:
         assert_equal(one, other)
     with pytest.raises(AssertionError):
         assert_equal(run(5)[0], run(6)[0])
+    # a seed with a start state rules the episodes after that one
+    env = fake(limit=3)
+    env.seed(5)
+    env.reset()
+    state = env.env_method("get_state")[0]
+    seconds = []
+    for seed in (8, 8, 9):
+        env.seed(seed)
+        env.set_options({"state": state})
+        env.reset()
+        seconds.append([env.step(np.zeros((3, 2), dtype=np.float32))[0] for _ in range(3)][-1])
+    assert_equal(seconds[0], seconds[1])  # type: ignore[arg-type]
+    assert (seconds[0]["state"] != seconds[2]["state"]).any()  # type: ignore[call-overload,index]
     # without seed(), by NumPy's generator, which set_random_seed seeds; nothing else is drawn from anybody
     env, states = fake(), []
     for _ in range(2):
@@ -298,6 +311,13 @@ SMALL: dict[str, Any] = {"net_arch": [16]}
 def test_simulations_that_cannot_be(num_envs: int, backend: str, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         simulation.choose_simulation(num_envs, backend, kwargs)
+
+
+def test_pictures_of_a_gpu_simulation_need_a_gpu_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation, "check_gpu_simulation", lambda name: None)
+    assert simulation.choose_simulation(2, "auto", {}, "cpu") == ("physx_cuda", {"reconfiguration_freq": 0})
+    with pytest.raises(RuntimeError, match="no Vulkan driver of the GPU"):
+        simulation.choose_simulation(2, "physx_cuda:0", {}, "cpu", visual=True)
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")

@@ -64,7 +64,7 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
         if state is not None:
             check_state(state, self.batch.env_id)
         self._next_state = None
-        # a seed is given to ManiSkill in any case, see the class
+        # a seed is given to ManiSkill in any case, see the class; a state has its own, and none is drawn for it
         episode_seed = int(self.np_random.integers(2**31)) if seed is None and state is None else seed or 0
         observations, infos = self.batch.reset(np.zeros(1, dtype=np.intp), [episode_seed], [state], options)
         return _first(observations), infos[0]
@@ -249,7 +249,9 @@ def build_batch(
         raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
     renderer = choose_renderer(env_id, obs_mode)
     task = check_task(env_id, robot_uids, control_mode, reward_mode, max_episode_steps)
-    sim_backend, simulation_kwargs = choose_simulation(num_envs, sim_backend, task_kwargs)
+    sim_backend, simulation_kwargs = choose_simulation(
+        num_envs, sim_backend, task_kwargs, renderer.backend, obs_mode == "visual"
+    )
     context = choose_visuals(visuals, software=renderer.software)
     with explained(env_id), context:
         env = gym.make(

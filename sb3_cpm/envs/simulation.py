@@ -11,12 +11,16 @@ import torch as th
 SIM_BACKENDS = ("auto", "physx_cpu", "physx_cuda")
 
 
-def choose_simulation(num_envs: int, sim_backend: str, task_kwargs: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+def choose_simulation(
+    num_envs: int, sim_backend: str, task_kwargs: Mapping[str, Any], renderer: str = "gpu", visual: bool = False
+) -> tuple[str, dict[str, Any]]:
     """
     :param num_envs: environments in one simulation
     :param sim_backend: ``"physx_cpu"``, ``"physx_cuda"`` (``"physx_cuda:1"`` for the second GPU), or ``"auto"``: the GPU for
         more than one environment
     :param task_kwargs: further arguments of the task
+    :param renderer: who draws: ``"gpu"``, ``"cpu"`` or ``"none"``
+    :param visual: whether observations have pictures
     :return: ManiSkill's name of the simulation, and the arguments with what a batch needs
     :raises ValueError: if these do not go together
     :raises RuntimeError: if this machine cannot simulate on a GPU, with the cure
@@ -40,6 +44,11 @@ def choose_simulation(num_envs: int, sim_backend: str, task_kwargs: Mapping[str,
         )
     if sim_backend != "physx_cpu":
         check_gpu_simulation(sim_backend)
+        if visual and renderer != "gpu":
+            raise RuntimeError(
+                "Pictures of a simulation on the GPU are drawn on the GPU, but SAPIEN finds no Vulkan driver of the GPU. Install "
+                "the one that belongs to its driver (`vulkaninfo` should list the card), or use obs_mode='state'."
+            )
     return sim_backend, kwargs
 
 

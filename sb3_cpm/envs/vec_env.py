@@ -70,20 +70,22 @@ class ManiSkillVecEnv(VecEnv):
 
     def _begin(self, rows: np.ndarray, options: dict[str, Any] | None = None) -> tuple[dict[str, np.ndarray], list[dict]]:
         states = [self.members[i].take_start() for i in rows]
-        seeds = [self._next_seed(i) if state is None else 0 for i, state in zip(rows.tolist(), states, strict=True)]
+        given = self._seeds if options is not None else [None] * self.num_envs  # SB3's seeds are for reset() only
+        seeds = [self._episode_seed(i, given[i], state) for i, state in zip(rows.tolist(), states, strict=True)]
         self._returns[rows], self._lengths[rows] = 0, 0
         return self.batch.reset(rows, seeds, states, options)
 
-    def _next_seed(self, i: int) -> int:
-        seed, self._seeds[i] = self._seeds[i], None
-        if seed is None and self._generators[i] is None:
-            drawn = int(np.random.randint(2**31))  # SB3 seeds NumPy's generator
-            self._generators[i] = seeding.np_random(drawn)[0]
-        elif seed is not None:
-            self._generators[i] = seeding.np_random(seed)[0]
-            return seed
+    def _episode_seed(self, i: int, given: int | None, state: StartState | None) -> int:
+        if given is not None:
+            self._generators[i] = seeding.np_random(given)[0]
+        if state is not None:
+            return state["seed"]  # none is drawn for it; the seed rules the episodes after this one
+        if given is not None:
+            return given
         generator = self._generators[i]
-        assert generator is not None
+        if generator is None:
+            # SB3 seeds NumPy's global generator
+            generator = self._generators[i] = seeding.np_random(int(np.random.randint(2**31)))[0]
         return int(generator.integers(2**31))
 
     def step_async(self, actions: np.ndarray) -> None:
