@@ -6,10 +6,12 @@ or without), and what comes out is what SAPIEN would have drawn, only coarser. I
 (:func:`sb3_cpm.envs.vulkan.cache_folder`).
 """
 
+import contextlib
 import functools
 import hashlib
 import os
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,7 +69,7 @@ def light_parts(filename: str) -> tuple[Part, ...]:
     limits = (FORMAT, KEEP, SHARE, FEWEST, MOST, SMALL, SMOOTH, SAMPLES)
     key = hashlib.sha256(f"{limits} {file.resolve()} {status.st_size} {status.st_mtime_ns}".encode()).hexdigest()
     cached = vulkan.cache_folder() / "meshes" / f"{file.stem}-{key[:16]}.npz"
-    if cached.exists():
+    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made again
         return _load(cached)
     parts = _make(filename)
     _save(cached, parts)
@@ -75,7 +77,7 @@ def light_parts(filename: str) -> tuple[Part, ...]:
 
 
 def _load(cached: Path) -> tuple[Part, ...]:
-    with np.load(cached) as arrays:
+    with open(cached, "rb") as file, np.load(file) as arrays:
         return tuple(Part(*(arrays[f"{name}{i}"] for name in Part._fields)) for i in range(int(arrays["n"])))
 
 
