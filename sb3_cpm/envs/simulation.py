@@ -46,8 +46,8 @@ def choose_simulation(
         check_gpu_simulation(sim_backend)
         if visual and renderer != "gpu":
             raise RuntimeError(
-                "Pictures of a simulation on the GPU are drawn on the GPU, but SAPIEN finds no Vulkan driver of the GPU. Install "
-                "the one that belongs to its driver (`vulkaninfo` should list the card), or use obs_mode='state'."
+                "Pictures of a simulation on the GPU are drawn on the GPU, but SAPIEN finds no Vulkan driver of the GPU. "
+                "Install the one that belongs to its driver (`vulkaninfo` should list the card), or use obs_mode='state'."
             )
     return sim_backend, kwargs
 
