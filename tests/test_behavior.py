@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from challenger_helpers import BOTH, SMALL, VECTOR, random_batch, small, weights
+from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, small, weights
 from torch import nn
 
 from sb3_cpm.challenger import Challenger
@@ -252,3 +252,15 @@ def test_compiled_it_computes_the_same(tmp_path: Any) -> None:
         assert one == pytest.approx(other, rel=1e-3, abs=1e-4)
     challenger.save(tmp_path / "challenger.pt")  # compiled weights have the same names
     small().load_state(tmp_path / "challenger.pt")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("amp", [False, True])
+def test_on_a_gpu_and_back(amp: bool, tmp_path: Any) -> None:
+    challenger = Challenger(BOTH, box(2), "cuda", preset=SMALL, amp=amp)
+    assert np.isfinite(challenger.train(random_batch(BOTH, 2))["world_model_loss"])
+    challenger.save(tmp_path / "challenger.pt")
+    loaded = Challenger.load(tmp_path / "challenger.pt", "cpu")
+    after = weights(loaded)
+    assert all(np.array_equal(value, after[key]) for key, value in weights(challenger).items())
+    assert np.isfinite(loaded.train(random_batch(BOTH, 2))["world_model_loss"]) and loaded.trained_updates == 2
