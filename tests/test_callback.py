@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 
 import gymnasium as gym
 import numpy as np
@@ -227,7 +226,15 @@ class RaisesAt(BaseCallback):
         return True
 
 
-@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals reach the main thread")
+@pytest.fixture()
+def ctrl_c():
+    """Python's own handler, even where the tests run in the background and the shell had Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_takes_the_wrapper_off_and_loses_nothing(tmp_path):
     model, callback = make_model(), make_callback()
     before = signal.getsignal(signal.SIGINT)
