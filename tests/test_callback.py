@@ -226,7 +226,7 @@ class RaisesAt(BaseCallback):
         return True
 
 
-@pytest.fixture()
+@pytest.fixture
 def ctrl_c():
     """Python's own handler, even where the tests run in the background and the shell had Ctrl-C ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
