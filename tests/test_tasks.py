@@ -113,6 +113,7 @@ def empty(file: Path) -> None:
         ("PickSingleYCB-v1", f"{YCB}/info_pick_v0.json", cut_off, "missing or damaged (JSONDecodeError)"),
         ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", Path.unlink, "002_can/collision.ply is missing"),
         ("PickSingleYCB-v1", f"{YCB}/models/002_can/textured.obj", empty, "002_can/textured.obj is empty"),
+        ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", cut_off, "002_can/collision.ply is damaged"),
         ("PickSingleEGAD-v1", f"{EGAD}/egad_train_set/A0_0.obj", Path.unlink, "egad_train_set/A0_0.obj is missing"),
         ("TurnFaucet-v1", f"{PARTNET}/5004/mobility_cvx.urdf", Path.unlink, "5004 is not there"),
         ("TurnFaucet-v1", f"{PARTNET}/5004/mobility_cvx.urdf", cut_off, "is damaged"),
@@ -158,6 +159,26 @@ def test_a_failed_download_leaves_nothing(asset_dir: Path, monkeypatch: pytest.M
     monkeypatch.setattr(download_asset, "download", succeed)
     assert len(list(assets.download(["PickSingleEGAD-v1"]))) == 1
     assert list(assets.download(["PickSingleEGAD-v1"])) == []  # what is there is not fetched again
+
+
+BROKEN = """
+from sb3_cpm.envs import make_maniskill_env
+for env_id in ("PickSingleYCB-v1", "PickSingleEGAD-v1", "TurnFaucet-v1"):
+    try:
+        make_maniskill_env(env_id).reset(seed=0)
+    except RuntimeError as error:
+        assert "ailed to load" in str(error) and f"assets --download {env_id}" in str(error), error
+        print("refused")
+"""
+
+
+def test_a_file_with_the_wrong_contents_is_an_error_with_the_cure(tmp_path: Path) -> None:
+    standin_assets.make_all(tmp_path)
+    for pattern in (f"{YCB}/models/*/textured.obj", f"{EGAD}/egad_train_set_coacd/*.obj", "partnet_mobility/shapes/*.obj"):
+        for file in (tmp_path / "data").glob(pattern):
+            file.write_text("hello")
+    child = run(["-c", BROKEN], MS_ASSET_DIR=str(tmp_path))
+    assert child.stdout.count("refused") == 3, child.stdout + child.stderr
 
 
 # ---------------------------------------------------------------------- states without a renderer

@@ -213,4 +213,11 @@ def _absent(files: list[Path]) -> list[str]:
             absent.append(f"{file.parent.name}/{file.name} is missing")
         elif file.stat().st_size == 0:
             absent.append(f"{file.parent.name}/{file.name} is empty")
+        elif file.suffix == ".ply" and not _starts_with(file, b"ply"):
+            absent.append(f"{file.parent.name}/{file.name} is damaged (no PLY)")  # SAPIEN would go on without the shape
     return absent
+
+
+def _starts_with(file: Path, start: bytes) -> bool:
+    with open(file, "rb") as opened:
+        return opened.read(len(start)) == start

@@ -129,7 +129,8 @@ def explained(env_id: str) -> Iterator[None]:
     except (FileNotFoundError, EOFError, SystemExit) as error:
         raise missing_assets(env_id, str(error)) from error
     except RuntimeError as error:
-        if "download" not in str(error).lower():
+        # "Failed to load ..." is SAPIEN's word for a damaged file
+        if "download" not in str(error).lower() and "failed to load" not in str(error).lower():
             raise
         raise missing_assets(env_id, str(error)) from error
     finally:

@@ -143,7 +143,11 @@ class PickSingleEGADEnv(BaseEnv):
         return actor
 
     def _after_reconfigure(self, options: dict) -> None:
-        lowest = [obj.get_first_collision_mesh(to_world_frame=False).bounds[0, 2] for obj in self._objs]
+        meshes = [obj.get_first_collision_mesh(to_world_frame=False) for obj in self._objs]
+        for obj, mesh in zip(self._objs, meshes, strict=True):
+            if mesh is None:  # SAPIEN goes on without shapes that it cannot read
+                raise RuntimeError(f"Failed to load the collision shapes of EGAD's {obj.name}: its file is damaged")
+        lowest = [mesh.bounds[0, 2] for mesh in meshes]
         self.object_zs = -common.to_tensor(lowest, device=self.device).float()
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
