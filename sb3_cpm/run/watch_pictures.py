@@ -192,23 +192,23 @@ def animation(dream: "Dream") -> bytes:
 def _frame(dream: "Dream", row: int) -> Image.Image:
     height, width = dream.truth[dream.images[0]].shape[1:3]
     factor = max(1, -(-PANEL // width))
-    panel_width, panel_height, gap, header, footer = width * factor, height * factor, 8, 44, 14
-    size = (3 * panel_width + 4 * gap, header + len(dream.images) * (panel_height + gap) + footer)
+    panel, gap, line_height = (width * factor, height * factor), 8, 20
+    block = line_height + panel[1]  # names of the panels, and the panels
+    size = (3 * panel[0] + 4 * gap, 2 * gap + line_height + len(dream.images) * block + 14)
     canvas = Image.new("RGB", size, "white")
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=14)
     seen = row < dream.context
     words = "the model sees this state" if seen else f"imagined, {row - dream.context + 1} steps without looking"
     draw.text((gap, 4), f"t = {row}: {words}", fill=BLUE if seen else ORANGE, font=font)
-    for column, name in enumerate(ROWS):
-        draw.text((gap + column * (panel_width + gap), 24), name, fill="black", font=font)
     for line, key in enumerate(dream.images):
         truth, model = dream.truth[key][row], dream.model[key][row]
+        top = gap + line_height + line * block
         for column, picture in enumerate((_rgb(truth), _rgb(model), _error_rgb(truth, model))):
-            panel = Image.fromarray((picture * 255).round().astype(np.uint8)).resize(
-                (panel_width, panel_height), Image.Resampling.NEAREST
-            )
-            canvas.paste(panel, (gap + column * (panel_width + gap), header + line * (panel_height + gap)))
-    _draw_progress(draw, dream, row, (gap, size[1] - footer, size[0] - gap, size[1] - footer + 6))
+            left = gap + column * (panel[0] + gap)
+            draw.text((left, top), f"{key}: {ROWS[column]}" if column == 0 else ROWS[column], fill="black", font=font)
+            pixels = Image.fromarray((picture * 255).round().astype(np.uint8))
+            canvas.paste(pixels.resize(panel, Image.Resampling.NEAREST), (left, top + line_height))
+    _draw_progress(draw, dream, row, (gap, size[1] - 12, size[0] - gap, size[1] - 6))
     return canvas.quantize(256, dither=Image.Dither.NONE)
 
 
