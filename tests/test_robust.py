@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
@@ -47,7 +49,6 @@ class Mortal(gym.Wrapper):
 
 
 def make(limit: int = 50, how: str = "none") -> gym.Env:
-    import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0, also in the worker)
 
     env = Mortal(gym.make("CPMToy-v0", keys=("state",)), limit)
     env.behave(how)
@@ -201,3 +202,11 @@ def test_the_whole_method_survives_the_death_of_a_worker() -> None:
     assert [length for i, length in lengths if i == 1] == [50, 11, 50, 20, 50]
     assert np.isfinite(buffer.sample(64, env=None).rewards.numpy()).all()
     env.close()
+
+
+def test_make_vec_env_of_sb3_makes_it() -> None:
+    kwargs = {"start_method": "fork", "episodes_per_worker": 5}
+    env = make_vec_env("CPMToy-v0", 2, seed=1, vec_env_cls=RobustSubprocVecEnv, vec_env_kwargs=kwargs)
+    assert env.env_is_wrapped(Monitor) == [True, True] and env.reset()["state"].shape == (2, 4)  # type: ignore
+    env.close()
+    env.close()  # once more does no harm

@@ -158,7 +158,7 @@ class Member:
         self.spec = spec_of(self._batch)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
+        if name.startswith("__") or name == "_batch":  # no recursion in one that is only half made
             raise AttributeError(name)
         owner = self._batch if hasattr(self._batch, name) else self._batch.env
         return getattr(owner, name)
