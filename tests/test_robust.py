@@ -49,7 +49,6 @@ class Mortal(gym.Wrapper):
 
 
 def make(limit: int = 50, how: str = "none") -> gym.Env:
-
     env = Mortal(gym.make("CPMToy-v0", keys=("state",)), limit)
     env.behave(how)
     return Monitor(env)
