@@ -1,5 +1,6 @@
 """Where and how CPMBuffer keeps observations, and that it is unchanged after whatever it refuses."""
 
+import contextlib
 import copy
 import pickle
 import resource
@@ -213,36 +214,35 @@ def test_it_says_how_much_memory_it_will_take(caplog, monkeypatch):
     assert caplog.records[-1].levelname == "WARNING", "a tenth of the memory is worth being told without asking"
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def full_disk():
-    """Call it, and no new file can be larger than 3 kB."""
+    """
+    Inside, no file can grow beyond 3 kB. Not for longer than the lines that need it: pytest's own output may go to a file.
+    """
     previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, previous)
 
-    def fill_up():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
 
-    yield fill_up
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    signal.signal(signal.SIGXFSZ, previous)
-
-
-def test_a_full_disk_at_construction(full_disk, tmp_path):
-    full_disk()
-    with pytest.raises(ValueError, match=r"Cannot reserve .* for 'cloud' .* are free there"):
+def test_a_full_disk_at_construction(tmp_path):
+    with full_disk(), pytest.raises(ValueError, match=r"Cannot reserve .* for 'cloud' .* are free there"):
         make(size=1000, memmap_dir=tmp_path)
 
 
-def test_a_full_disk_under_a_memory_map(full_disk, tmp_path):
+def test_a_full_disk_under_a_memory_map(tmp_path):
     """The blocks are taken at construction; only the last observations of episodes need more, and are asked for in advance."""
     buffer = make(size=2000, memmap_dir=tmp_path)
     first = fill(buffer, [3])
     while len(buffer.ring.final._free) > 2:
         first = fill(buffer, [3], first)
-    full_disk()
     buffer.ring.final._free.clear()
     before = [(episode.start, episode.length) for episode in buffer.episodes], buffer.pos
-    with pytest.raises(ValueError, match="Cannot reserve"):
+    with full_disk(), pytest.raises(ValueError, match="Cannot reserve"):
         add(buffer, first, done=True)
     assert ([(episode.start, episode.length) for episode in buffer.episodes], buffer.pos) == before
     assert buffer.sample(50).rewards.shape == (50, 1)

@@ -282,6 +282,8 @@ def test_csv_table_is_complete_after_every_row(tmp_path: Path) -> None:
     assert np.isnan(found["b"][0]) and found["b"][1] == pytest.approx(1 / 3, rel=1e-5)
     table.close()
     assert read_csv(tmp_path / "missing.csv") == {}
+    (tmp_path / "empty.csv").touch()
+    assert read_csv(tmp_path / "empty.csv") == {}
 
 
 def test_running_mean() -> None:

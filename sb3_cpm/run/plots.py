@@ -38,8 +38,8 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
         return {}
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
+        names = reader.fieldnames or []  # reads the first line if nobody has: not after the file is closed
         rows = list(reader)
-    names = reader.fieldnames or []
     return {name: np.array([float(row[name]) if row[name] else np.nan for row in rows]) for name in names}
 
 
