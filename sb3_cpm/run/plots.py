@@ -96,7 +96,7 @@ def _draw_returns(axes: Axes, episodes: dict[str, np.ndarray], evaluations: dict
         axes.errorbar(
             evaluations["step"],
             mean,
-            [mean - evaluations["min_return"], evaluations["max_return"] - mean],
+            np.stack([mean - evaluations["min_return"], evaluations["max_return"] - mean]),
             color=ORANGE,
             fmt="o-",
             ms=6,
