@@ -21,9 +21,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.challenges import CRITERIA, Proposal
+from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
 from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
 
 
@@ -227,29 +228,32 @@ class ChallengerCallback(BaseCallback):
         assert self.challenger is not None
         self.proposals = []
         for episode in self.buffer.pop_completed():
-            with self.stopwatch.section("bookkeeping"):
-                if self.challenger.trained_updates == 0:
+            if self.challenger.trained_updates == 0:
+                with self.stopwatch.section("bookkeeping"):
                     self.buffer.remember_reward(episode)  # what an untrained model says about novelty is noise
-                    continue
-                observations = self.buffer.episode_observations(episode, self.challenger.keys)
-                actions = self.buffer.episode_actions(episode)
-            with self.stopwatch.section("C evaluates"):
-                evaluation = self.challenger.evaluate(observations, actions)
+                continue
+            evaluation = self._evaluate(episode)
             with self.stopwatch.section("bookkeeping"):
                 proposal = self.buffer.propose(episode, evaluation)
                 if proposal is not None:
                     self.proposals.append((episode, proposal))
                     self._log_proposal(proposal)
 
+    def _evaluate(self, episode: Episode) -> Evaluation:
+        """What the challenger, as it is now, thinks of an episode that is still in D."""
+        assert self.challenger is not None
+        with self.stopwatch.section("bookkeeping"):
+            observations = self.buffer.episode_observations(episode, self.challenger.keys)
+            actions = self.buffer.episode_actions(episode)
+        with self.stopwatch.section("C evaluates"):
+            return self.challenger.evaluate(observations, actions)
+
     def _refresh_challenges(self) -> None:
         """Beyond the report: what today's world model thinks of the challenges in I, every ``refresh_every`` transitions."""
-        assert self.challenger is not None
         for challenge in self.buffer.due_for_refresh():
-            observations = self.buffer.episode_observations(challenge.episode, self.challenger.keys)
-            actions = self.buffer.episode_actions(challenge.episode)
-            with self.stopwatch.section("C evaluates"):
-                evaluation = self.challenger.evaluate(observations, actions)
-            change = self.buffer.refresh(challenge, evaluation)
+            evaluation = self._evaluate(challenge.episode)
+            with self.stopwatch.section("bookkeeping"):
+                change = self.buffer.refresh(challenge, evaluation)
             self.logger.record_mean("challenge/refresh_change", change)
         age = self.buffer.pop_sampled_age()
         if age is not None:
@@ -287,7 +291,7 @@ class ChallengerCallback(BaseCallback):
         if proposal.artificial is not None:
             self.logger.record_mean("challenge/length", len(proposal.artificial.total))
             self.logger.record_mean("challenge/reward", proposal.artificial.total.mean())
-            for term in ("extrinsic", "exploration", "embedding", "step"):
+            for term in REWARD_TERMS:
                 self.logger.record_mean(f"challenge/reward_{term}", getattr(proposal.artificial, term).mean())
 
     # ------------------------------------------------------------------ coming and going

@@ -128,8 +128,9 @@ class ExplorationVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         obs = self.venv.reset()
+        original = self._original(obs)
         for env_idx in range(self.num_envs):
-            self._start_episode(env_idx, self._original(obs))
+            self._start_episode(env_idx, original)
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -149,9 +150,10 @@ class ExplorationVecEnv(VecEnvWrapper):
             self.stopwatch.stop("simulate+render")
             self._n_steps += 1
             if self.active:
-                self._check_finite(self._original(obs), rewards, dones, infos)
+                original = self._original(obs)
+                self._check_finite(original, rewards, dones, infos)
                 with self.stopwatch.section("C acts"):
-                    self._follow(self._original(obs), dones, infos)
+                    self._follow(original, dones, infos)
             return obs, rewards, dones, infos
         except (EOFError, ConnectionError) as error:
             self.on_failure()

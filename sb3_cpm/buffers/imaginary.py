@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sb3_cpm.buffers.storage import Episode
-from sb3_cpm.challenges import CRITERIA, Proposal
+from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Challenge:
         """The four terms of its rewards, each times its coefficient, before halving, shape ``(goal - start + 1,)``."""
         artificial = self.proposal.artificial
         assert artificial is not None
-        return {name: getattr(artificial, name) for name in ("extrinsic", "exploration", "embedding", "step")}
+        return {name: getattr(artificial, name) for name in REWARD_TERMS}
 
     @property
     def rewards(self) -> np.ndarray:

@@ -77,7 +77,6 @@ class FinalObservations:
     """
 
     def __init__(self, codecs: Mapping[str, Codec], allocate: Allocate):
-        self._codecs = codecs
         self._allocate = allocate
         self.arrays = {
             key: allocate(f"final_{key}", (0, *codec.stored_shape), codec.stored_dtype) for key, codec in codecs.items()

@@ -13,11 +13,12 @@ Challenge choice in NumPy: one module per step of the method (report, section 4.
 from sb3_cpm.challenges.curator import ChallengeCurator, Proposal
 from sb3_cpm.challenges.filters import CRITERIA, ChallengeFilter
 from sb3_cpm.challenges.quality import ChallengeQuality
-from sb3_cpm.challenges.rewards import ArtificialReward, ArtificialRewards
+from sb3_cpm.challenges.rewards import REWARD_TERMS, ArtificialReward, ArtificialRewards
 from sb3_cpm.challenges.targeting import DynamicCoefficient
 
 __all__ = [
     "CRITERIA",
+    "REWARD_TERMS",
     "ArtificialReward",
     "ArtificialRewards",
     "ChallengeCurator",

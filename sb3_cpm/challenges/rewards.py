@@ -12,6 +12,9 @@ import numpy as np
 
 from sb3_cpm.challenges.targeting import DynamicCoefficient
 
+#: The terms of an artificial reward, attributes of :class:`ArtificialRewards`.
+REWARD_TERMS = ("extrinsic", "exploration", "embedding", "step")
+
 
 @dataclass(frozen=True)
 class ArtificialRewards:

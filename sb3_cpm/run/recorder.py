@@ -18,9 +18,7 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 
 from sb3_cpm.buffers import EXECUTED_ACTION, Episode
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.challenges import Proposal
-
-REWARD_TERMS = ("total", "extrinsic", "exploration", "embedding", "step")
+from sb3_cpm.challenges import REWARD_TERMS, Proposal
 
 
 class CSVTable:
@@ -204,10 +202,7 @@ def _proposal_row(episode: Episode, proposal: Proposal) -> dict[str, Any]:
         "mean_kl": float(proposal.kl[counted].mean()),
         "mean_score": float(proposal.score[counted].mean()),
         "goal_score": float(proposal.score[proposal.goal]),
-        **{
-            f"artificial_{name}": _mean_of(artificial, name)
-            for name in ("total", "extrinsic", "exploration", "embedding", "step")
-        },
+        **{f"artificial_{name}": _mean_of(artificial, name) for name in ("total", *REWARD_TERMS)},
         **{name: float(value) for name, value in proposal.coefficients.items()},
     }
 
