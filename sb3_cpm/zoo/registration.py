@@ -1,0 +1,69 @@
+"""
+Gymnasium ids of the tasks, so that rl_zoo3 finds them: ``CPM/PickCube-v1`` as the robot sees it (cameras, point cloud, what it
+knows of itself), ``CPM/PickCubeState-v1`` as ManiSkill's full state vector. Only an id is registered; ManiSkill is imported when
+an environment is made. Arguments of :func:`~sb3_cpm.envs.make_maniskill_env` go into ``env_kwargs`` of the YAML.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+
+import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+
+TASKS = (
+    "PickCube-v1",
+    "StackCube-v1",
+    "PickSingleYCB-v1",
+    "TurnFaucet-v1",
+    "OpenCabinetDoor-v1",
+    "PickSingleEGAD-v1",
+    "LiftCube-v1",
+)
+"""The seven tasks that the configurations name."""
+
+NAMESPACE = "CPM/"
+
+
+def env_id_of(task: str, state: bool = False) -> str:
+    """
+    >>> env_id_of("PickCube-v1"), env_id_of("PickCube-v1", state=True)
+    ('CPM/PickCube-v1', 'CPM/PickCubeState-v1')
+
+    :param task: ManiSkill's name of it
+    :param state: the variant whose observation is the full state vector
+    :return: gymnasium's id
+    """
+    name, _, version = task.rpartition("-v")
+    return f"{NAMESPACE}{name}{'State' if state else ''}-v{version}"
+
+
+ENV_IDS = tuple(env_id_of(task, state) for state in (False, True) for task in TASKS)
+"""All ids that :func:`register_tasks` registers."""
+
+
+def register_tasks() -> None:
+    """Make the ids known to gymnasium. Can be repeated."""
+    for state in (False, True):
+        for task in TASKS:
+            if env_id_of(task, state) not in gym.registry:
+                gym.register(
+                    id=env_id_of(task, state),
+                    entry_point="sb3_cpm.zoo.registration:make_task",
+                    kwargs={"task": task, **({"obs_mode": "state"} if state else {})},
+                    # both wrap what is already checked and ordered, and would hide `batch` from wrappers
+                    disable_env_checker=True,
+                    order_enforce=False,
+                )
+
+
+def make_task(task: str, render_mode: str | None = None, **kwargs: Any) -> gym.Env:
+    """
+    What gymnasium calls to make an environment.
+
+    :param task: ManiSkill's name of it
+    :param render_mode: ``"rgb_array"``, None, or ``"human"``, which ``enjoy`` wants: SB3 then shows the ``"rgb_array"``
+    :param kwargs: of :func:`~sb3_cpm.envs.make_maniskill_env`
+    """
+    from sb3_cpm.envs import make_maniskill_env
+
+    return make_maniskill_env(task, render_mode="rgb_array" if render_mode == "human" else render_mode, **kwargs)
