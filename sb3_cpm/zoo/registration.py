@@ -1,7 +1,7 @@
 """
-Gymnasium ids of the tasks, so that rl_zoo3 finds them: ``CPM/PickCube-v1`` as the robot sees it (cameras, point cloud, what it
-knows of itself), ``CPM/PickCubeState-v1`` as ManiSkill's full state vector. Only an id is registered; ManiSkill is imported when
-an environment is made. Arguments of :func:`~sb3_cpm.envs.make_maniskill_env` go into ``env_kwargs`` of the YAML.
+Gymnasium ids of the tasks, so that rl_zoo3 finds them: ``CPM/PickCube-v1`` as the robot sees it (cameras, point cloud, what
+it knows of itself), ``CPM/PickCubeState-v1`` as ManiSkill's full state vector. Only an id is registered; ManiSkill is imported
+when an environment is made. Arguments of :func:`~sb3_cpm.envs.make_maniskill_env` go into ``env_kwargs`` of the YAML.
 """
 
 from typing import Any
