@@ -1,0 +1,302 @@
+"""
+Agents by name: a file of ``zoo_configs/`` becomes a model with its callback and its environments.
+
+rl_zoo3 reads the same files (``python -m rl_zoo3.train --algo sac --conf-file zoo_configs/cpm_sac.yml --gym-packages
+sb3_cpm.zoo``), so its own :class:`~rl_zoo3.exp_manager.ExperimentManager` does the reading here too: schedules, wrappers,
+normalization and action noise follow its rules. What is added: keys are checked before anything is built, entries can be
+overridden in depth, and nothing is written.
+"""
+
+import argparse
+import contextlib
+import copy
+import difflib
+import inspect
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cpm.buffers import CPMBuffer
+
+#: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
+ZOO_KEYS = (
+    "n_timesteps",
+    "n_envs",
+    "env_kwargs",
+    "env_wrapper",
+    "vec_env_wrapper",
+    "normalize",
+    "frame_stack",
+    "callback",
+    "monitor_kwargs",
+    "noise_type",
+    "noise_std",
+)
+
+
+class Built(NamedTuple):
+    """
+    What :meth:`Agent.build` makes.
+
+    :param model: the SB3 model
+    :param callbacks: those of the configuration, in its order; empty where it names none
+    :param env: the training environments of the model
+    :param make_eval_env: makes one further environment with the same wrappers, in a VecEnv of its own
+    """
+
+    model: BaseAlgorithm
+    callbacks: list[BaseCallback]
+    env: VecEnv
+    make_eval_env: Callable[[], VecEnv]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """
+    An algorithm with its hyperparameters on one environment. Use :func:`load_agent` to get one.
+
+    :param name: of its file, without the suffix
+    :param algo: rl_zoo3's name of the algorithm
+    :param env_id: a registered gymnasium id
+    :param hyperparameters: plain data, as rl_zoo3 reads it
+    :param path: of its file
+    """
+
+    name: str
+    algo: str
+    env_id: str
+    hyperparameters: dict[str, Any]
+    path: Path
+
+    @property
+    def n_timesteps(self) -> int:
+        """Length of a run in environment steps."""
+        return int(float(self.hyperparameters["n_timesteps"]))
+
+    @property
+    def n_envs(self) -> int:
+        """Number of parallel environments."""
+        return int(self.hyperparameters.get("n_envs", 1))
+
+    def build(
+        self,
+        seed: int,
+        n_envs: int | None = None,
+        device: str = "auto",
+        vec_env_type: str = "dummy",
+        load_path: str | Path | None = None,
+    ) -> Built:
+        """
+        Make environments and model.
+
+        :param seed: rules model and environments
+        :param n_envs: parallel environments; None: as the configuration says
+        :param device: PyTorch device
+        :param vec_env_type: ``"dummy"`` or ``"subproc"``
+        :param load_path: go on with this saved model instead of making a new one
+        :return: model, callbacks and environments
+        :raises ValueError: where the algorithm, a wrapper or the environment refuses its arguments
+        """
+        manager, hyperparameters = self._manager(seed, device, vec_env_type)
+        env = _quietly(manager.create_envs, n_envs or manager.n_envs, no_log=True)
+        try:
+            hyperparameters = _quietly(manager._preprocess_action_noise, hyperparameters, {}, env)
+            algorithm = algorithms()[self.algo]
+            if load_path is None:
+                model = algorithm(env=env, seed=seed, device=device, **hyperparameters)
+            else:
+                model = algorithm.load(load_path, env=env, device=device)
+        except BaseException:
+            env.close()
+            raise
+
+        def make_eval_env() -> VecEnv:
+            return _quietly(manager.create_envs, 1, eval_env=True, no_log=True)
+
+        return Built(model, manager.callbacks, env, make_eval_env)
+
+    def _manager(self, seed: int, device: str, vec_env_type: str) -> tuple[Any, dict[str, Any]]:
+        """rl_zoo3's manager, and the arguments of the algorithm as it has read them."""
+        from rl_zoo3 import exp_manager
+
+        vars(exp_manager).setdefault("CPMBuffer", CPMBuffer)  # what `replay_buffer_class: CPMBuffer` is evaluated in
+        manager = _quietly(
+            exp_manager.ExperimentManager,
+            argparse.Namespace(),
+            self.algo,
+            self.env_id,
+            log_folder="",
+            seed=seed,
+            verbose=0,
+            vec_env_type=vec_env_type,
+            device=device,
+            config=str(self.path),
+        )
+        # it changes what it is given; and its own read_hyperparameters() would bring back entries that were removed
+        hyperparameters, manager.env_wrapper, manager.callbacks, manager.vec_env_wrapper = _quietly(
+            manager._preprocess_hyperparams, copy.deepcopy(self.hyperparameters)
+        )
+        manager.eval_env_kwargs = manager.env_kwargs  # what came from the file, too
+        return manager, hyperparameters
+
+
+def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, Any] | None = None) -> Agent:
+    """
+    Read an agent's hyperparameters for an environment.
+
+    >>> load_agent("cpm_sac", "MountainCarContinuous-v0", {"gamma": 0.99, "policy_kwargs": {"net_arch": [64]}}).algo
+    'sac'
+
+    :param name_or_path: of a file in ``zoo_configs/``, without the suffix, or the path of one
+    :param env_id: a gymnasium id; an environment that the file does not name gets its entry ``default``
+    :param overrides: entries that win over those of the file, dicts within dicts entry by entry; None removes an entry
+    :return: the agent
+    :raises ValueError: for names that do not exist, with the nearest that does; for files that are no such configuration
+    """
+    path = find_config(name_or_path)
+    ensure_registered(env_id)
+    entries = _read(path)
+    if env_id not in entries and "default" not in entries:
+        raise ValueError(f"{path} has neither an entry {env_id!r} nor a default. It has {', '.join(map(repr, entries))}.")
+    found = entries.get(env_id, entries.get("default"))
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: the entry of {env_id} must be a mapping of hyperparameters, got {found!r}.")
+    merged = merge(found, overrides or {})
+    algo = algorithm_of(path.stem)
+    _check_keys(merged, algo, path, env_id)
+    return Agent(path.stem, algo, env_id, merged, path)
+
+
+# ---------------------------------------------------------------------- names
+
+
+def config_folder() -> Path:
+    """
+    :return: ``zoo_configs/`` of the checkout that this package is in, or else of the working directory
+    :raises ValueError: where there is none
+    """
+    candidates = [Path(__file__).resolve().parents[2] / "zoo_configs", Path.cwd() / "zoo_configs"]
+    for folder in candidates:
+        if folder.is_dir():
+            return folder
+    raise ValueError(f"No folder zoo_configs, neither in {candidates[0].parent} nor here: give the path of a file.")
+
+
+def find_config(name_or_path: str | Path) -> Path:
+    """
+    :param name_or_path: a name in ``zoo_configs/``, or a path
+    :return: the file
+    :raises ValueError: if there is none, with the nearest name
+    """
+    given = Path(name_or_path)
+    if given.suffix in (".yml", ".yaml"):
+        if given.is_file():
+            return given
+        raise ValueError(f"There is no file {given}.")
+    folder = config_folder()
+    names = sorted(path.stem for path in folder.glob("*.yml"))
+    if str(name_or_path) not in names:
+        raise ValueError(f"Unknown agent {str(name_or_path)!r}.{nearest(str(name_or_path), names)} Known: {', '.join(names)}.")
+    return folder / f"{name_or_path}.yml"
+
+
+def algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """:return: rl_zoo3's algorithms by name, and ours where they are registered"""
+    from rl_zoo3.utils import ALGOS
+
+    return ALGOS
+
+
+def algorithm_of(name: str) -> str:
+    """
+    The algorithm that a file is for: the one that is a part of its name.
+
+    >>> algorithm_of("cpm_sac_report")
+    'sac'
+
+    :raises ValueError: if no part is one
+    """
+    known = algorithms()
+    padded = f"_{name}_"
+    matches = [algo for algo in known if f"_{algo}_" in padded]
+    if not matches:
+        raise ValueError(f"The name {name!r} contains no algorithm (one of {', '.join(known)}): rename the file, my_sac.yml.")
+    return max(matches, key=len)  # ppo_lstm, not ppo
+
+
+def ensure_registered(env_id: str) -> None:
+    """
+    Import what registers an environment, if it is one that a known package brings.
+
+    :raises ValueError: if gymnasium does not know it, with the nearest name
+    """
+    if env_id not in gym.registry and env_id.startswith(("PointMaze", "AntMaze", "Fetch")):
+        try:
+            import gymnasium_robotics
+        except ImportError as error:
+            raise ValueError(f"{env_id} needs a package that is missing: pip install gymnasium-robotics") from error
+        gym.register_envs(gymnasium_robotics)
+    if env_id not in gym.registry:
+        raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
+
+
+def nearest(name: str, valid: list[str]) -> str:
+    """:return: a sentence with the most similar name, "" where nothing is"""
+    matches = difflib.get_close_matches(name, valid, n=1, cutoff=0.4)
+    return f" Did you mean {matches[0]!r}?" if matches else ""
+
+
+# ---------------------------------------------------------------------- reading
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path}: expected hyperparameters by environment, got {type(entries).__name__}.")
+    return entries
+
+
+def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param base: is not changed
+    :param overrides: dicts are merged entry by entry, everything else replaces; None removes
+    :return: both
+    """
+    result = copy.deepcopy(dict(base))
+    for key, value in overrides.items():
+        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
+            result[key] = merge(result[key], value)
+        elif value is None:
+            result.pop(key, None)
+        else:
+            result[key] = copy.deepcopy(value)
+    return result
+
+
+def _check_keys(hyperparameters: Mapping[str, Any], algo: str, path: Path, env_id: str) -> None:
+    """A misspelt key would otherwise surface as a TypeError of some constructor, after the environments are made."""
+    arguments = set(inspect.signature(algorithms()[algo].__init__).parameters) - {"self", "env", "seed", "device"}
+    valid = sorted({*arguments, *ZOO_KEYS})
+    for key in hyperparameters:
+        if key not in valid:
+            raise ValueError(f"{path}, {env_id}: unknown key {key!r}.{nearest(key, valid)} Valid: {', '.join(valid)}.")
+    missing = {"policy", "n_timesteps"} - set(hyperparameters)
+    if missing:
+        raise ValueError(f"{path}, {env_id}: {' and '.join(sorted(missing))} must be there.")
+
+
+def _quietly(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """rl_zoo3 prints what it reads; here that is in the run's config.yml."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return function(*args, **kwargs)
