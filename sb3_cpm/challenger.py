@@ -5,6 +5,7 @@ It knows nothing of SB3's training loop: whoever conducts it hands it observatio
 come from torch's global generator, so that one seed rules the run.
 """
 
+import copy
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -76,15 +77,43 @@ class Challenger:
         self.uncertainty_kwargs = {**defaults, **(uncertainty_kwargs or {})}
         model = self.world_model
         sizes = LatentSizes(model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim)
-        self.uncertainty = kind(sizes, **self.uncertainty_kwargs).to(self.device)
         feat = (self.world_model.feat_dim, self.action_dim, self.preset)
-        self.exploration = ActorCritic("exploration", *feat).to(self.device)
+        self._uncertainty: Uncertainty | None = None
+        self._exploration: ActorCritic | None = None
+        if self.preset["train_exploration_behavior"]:
+            self._uncertainty = kind(sizes, **self.uncertainty_kwargs).to(self.device)
+            self._exploration = ActorCritic("exploration", *feat).to(self.device)
         self.task = ActorCritic("task", *feat).to(self.device) if self.preset["train_task_behavior"] else None
         self.optimizers = self._make_optimizers()
         if self.preset["amp"]:
             check_mixed_precision(self.device)
         #: whether torch.compile was asked for and works here
         self.compiled = self.preset["compile"] and compile_modules(self._hot_modules(), self.device)
+
+    @property
+    def explores(self) -> bool:
+        """Whether it has a novelty measure and an exploration behaviour; ``train_exploration_behavior=False`` leaves them out."""
+        return self._exploration is not None
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """:raises ValueError: for a challenger that has none"""
+        if self._uncertainty is None:
+            raise ValueError(_NO_EXPLORATION.format("uncertainty"))
+        return self._uncertainty
+
+    @property
+    def exploration(self) -> ActorCritic:
+        """:raises ValueError: for a challenger that has none"""
+        if self._exploration is None:
+            raise ValueError(_NO_EXPLORATION.format("exploration behaviour"))
+        return self._exploration
+
+    @property
+    def behaviors(self) -> dict[str, ActorCritic]:
+        """The actor-critics that it has, "exploration" and "task"."""
+        both = {"exploration": self._exploration, "task": self.task}
+        return {name: behavior for name, behavior in both.items() if behavior is not None}
 
     def _uncertainty_class(self, kind: str | type[Uncertainty]) -> tuple[str, type[Uncertainty], dict[str, Any]]:
         """Its name in checkpoints, the class, and the preset's arguments for it."""
@@ -99,22 +128,20 @@ class Challenger:
     def _make_optimizers(self) -> dict[str, Optimizer]:
         common = {"eps": self.preset["adam_eps"], "clip": self.preset["grad_clip"]}
         common["weight_decay"] = self.preset["weight_decay"]
-        optimizers = {
-            "world_model": Optimizer("world model", [self.world_model], self.preset["model_lr"], **common),
-            "uncertainty": Optimizer("uncertainty", [self.uncertainty], self.preset["uncertainty_lr"], **common),
-            **self.exploration.make_optimizers(),
-        }
-        if self.task is not None:
-            optimizers.update(self.task.make_optimizers())
+        optimizers = {"world_model": Optimizer("world model", [self.world_model], self.preset["model_lr"], **common)}
+        if self._uncertainty is not None:
+            optimizers["uncertainty"] = Optimizer("uncertainty", [self._uncertainty], self.preset["uncertainty_lr"], **common)
+        for behavior in self.behaviors.values():
+            optimizers.update(behavior.make_optimizers())
         return optimizers
 
     def _hot_modules(self) -> list[torch.nn.Module]:
         """What nearly all of the time goes into; none of it draws random numbers, and none contains another."""
         model = self.world_model
         heads = [model.reward_head, *([] if model.continue_head is None else [model.continue_head])]
-        behaviors = [self.exploration, *([] if self.task is None else [self.task])]
-        actors = [part for one in behaviors for part in (one.actor.net, one.critic)]
-        novelty = [part for part in self.uncertainty.modules() if isinstance(part, (Ensemble, MLP))]
+        actors = [part for one in self.behaviors.values() for part in (one.actor.net, one.critic)]
+        measure = () if self._uncertainty is None else self._uncertainty.modules()
+        novelty = [part for part in measure if isinstance(part, (Ensemble, MLP))]
         return [model.encoder, model.decoder, model.rssm, model.rssm.prior_net, *heads, *actors, *novelty]
 
     # ---- acting ------------------------------------------------------------------------------------------------------
@@ -163,15 +190,22 @@ class Challenger:
         return LatentState(*(part[-1] for part in rows))
 
     @torch.no_grad()
-    def act(self, state: LatentState, deterministic: bool = False) -> np.ndarray:
+    def act(self, state: LatentState, deterministic: bool = False, behavior: str = "exploration") -> np.ndarray:
         """
-        Actions of the exploration actor.
+        Actions of one of its behaviours.
 
         :param state: latent state, ``n`` columns
         :param deterministic: the policy's mode instead of a sample
+        :param behavior: "exploration" or "task"
         :return: shape ``(n, action_dim)``, within [-1, 1]
+        :raises ValueError: for a behaviour that it does not have
         """
-        policy = self.exploration.actor(state.feat)
+        if behavior not in self.behaviors:
+            raise ValueError(
+                f"This challenger has the behaviours {list(self.behaviors)}, not {behavior!r}: build it with the preset entry "
+                f"'train_{behavior}_behavior': True."
+            )
+        policy = self.behaviors[behavior].actor(state.feat)
         return (policy.mode if deterministic else policy.rsample()).cpu().numpy()
 
     # ---- judging -----------------------------------------------------------------------------------------------------
@@ -233,7 +267,8 @@ class Challenger:
 
     def train(self, batch: SequenceBatch) -> dict[str, float]:
         """
-        One update of everything: world model, uncertainty, exploration behaviour (and task behaviour if the preset asks).
+        One update of everything: world model, uncertainty and exploration behaviour (unless the preset leaves them out), task
+        behaviour (if the preset asks for it).
 
         Sequences longer than any episode are fine: they run on into the next episode (``is_first`` resets the state there),
         and where nothing follows they are padded, with ``mask`` False. Padding has no influence on anything.
@@ -246,9 +281,11 @@ class Challenger:
         with mixed_precision(self.device, self.preset["amp"]):
             output = self.world_model.loss(sequences)
         metrics = self._step_world_model(output)
-        metrics.update(self._train_uncertainty(sequences, output))
+        if self.explores:
+            metrics.update(self._train_uncertainty(sequences, output))
         start = self._imagination_starts(sequences, output)
-        metrics.update(self.exploration.update(self.world_model, start, self._imagined_novelty, self.optimizers))
+        if self.explores:
+            metrics.update(self.exploration.update(self.world_model, start, self._imagined_novelty, self.optimizers))
         if self.task is not None:
             metrics.update(self.task.update(self.world_model, start, self._imagined_reward, self.optimizers))
         self.trained_updates += 1
@@ -315,12 +352,10 @@ class Challenger:
     @property
     def networks(self) -> dict[str, torch.nn.Module]:
         """Everything with weights, by name."""
-        parts: dict[str, torch.nn.Module] = {
-            "world_model": self.world_model,
-            "uncertainty": self.uncertainty,
-            "exploration": self.exploration,
-        }
-        return parts if self.task is None else {**parts, "task": self.task}
+        parts: dict[str, torch.nn.Module] = {"world_model": self.world_model}
+        if self._uncertainty is not None:
+            parts["uncertainty"] = self._uncertainty
+        return {**parts, **self.behaviors}
 
     def state_dict(self, include_rng: bool = True) -> dict[str, Any]:
         """
@@ -355,6 +390,37 @@ class Challenger:
             torch.set_rng_state(state["rng"]["cpu"].cpu())
             if torch.cuda.is_available() and len(state["rng"]["cuda"]) == torch.cuda.device_count():
                 torch.cuda.set_rng_state_all([rng.cpu() for rng in state["rng"]["cuda"]])
+
+    def adopt(self, other: "Challenger") -> tuple[str, ...]:
+        """
+        Start from what another challenger has learnt: the networks that both have, with their optimizers; learning rates stay
+        this one's.
+
+        :param other: one that reads the same observations, with the same sizes
+        :return: names of the networks that were taken over; the world model is always among them
+        :raises ValueError: if it reads others, has other sizes (naming the first mismatch) or another measure of uncertainty;
+            nothing is changed then
+        """
+        theirs, ours = other._config(), self._config()
+        if list(theirs["keys"].items()) != list(ours["keys"].items()):
+            raise ValueError(f"The one to start from reads the observations {theirs['keys']}, this one reads {ours['keys']}.")
+        names = tuple(name for name in self.networks if name in other.networks)
+        if "uncertainty" in names and self.uncertainty_name != other.uncertainty_name:
+            raise ValueError(
+                f"The one to start from has the uncertainty {other.uncertainty_name}, not {self.uncertainty_name}."
+            )
+        for name in names:
+            check_sizes(name, self.networks[name].state_dict(), other.networks[name].state_dict())
+        for name in names:
+            self.networks[name].load_state_dict(other.networks[name].state_dict())
+        for name, optimizer in self.optimizers.items():
+            if name in other.optimizers:
+                rates = [group["lr"] for group in optimizer.adam.param_groups]
+                optimizer.load_state_dict(copy.deepcopy(other.optimizers[name].state_dict()))  # torch would share the moments
+                for group, rate in zip(optimizer.adam.param_groups, rates, strict=True):
+                    group["lr"] = rate
+        self.trained_updates = other.trained_updates
+        return names
 
     def save(self, path: str | os.PathLike, include_rng: bool = True) -> None:
         """
@@ -433,6 +499,9 @@ class Challenger:
         )
         challenger.load_state_dict(content["state"], restore_rng)
         return challenger
+
+
+_NO_EXPLORATION = "This challenger has no {}: it was built with the preset entry 'train_exploration_behavior': False."
 
 
 def _space(entry: Mapping[str, Any]) -> spaces.Box:

@@ -62,7 +62,8 @@ REPORT: dict[str, Any] = {
     "critic_units": 400,  # size of each of them
     "slow_target": True,  # bootstrap from a slow copy of the critic
     "slow_target_every": 100,  # updates between two copies
-    "train_task_behavior": False,  # also train an actor-critic for the task; the challenger does not act with it
+    "train_task_behavior": False,  # also train an actor-critic for the task, which the challenger beside a player does not need
+    "train_exploration_behavior": True,  # novelty measure and exploration actor-critic, which a plain Dreamer does not need
     # speed, see sb3_cpm.world_model.acceleration
     "amp": False,  # train in bfloat16 mixed precision; pays on GPUs
     "compile": False,  # torch.compile of the hot parts; takes minutes at the start, pays on GPUs

@@ -1,0 +1,330 @@
+"""
+What Dreamer and Plan2Explore share: SB3's off-policy loop around a challenger that acts by itself.
+
+The latent state follows every step of ``learn()``, the random ones at the beginning included, with the action that was really
+executed. What the world model learns from are the episodes in a :class:`~sb3_cpm.buffers.CPMBuffer` without challenges: true
+last observations, a row for every reset (see :class:`~sb3_cpm.type_aliases.SequenceBatch`).
+"""
+
+import io
+import os
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_pkl
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.buffers.checks import check_environment
+from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
+from sb3_cpm.challenger import Challenger, choose_device
+from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
+from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
+from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
+from sb3_cpm.dreamer.start import StartFrom, read_challenger
+from sb3_cpm.presets import make_preset
+from sb3_cpm.type_aliases import SequenceBatch
+from sb3_cpm.world_model.checkpoint import check_finite
+from sb3_cpm.world_model.observations import check_action_space
+
+
+class DreamerAlgorithm(OffPolicyAlgorithm):
+    """
+    Base of :class:`~sb3_cpm.dreamer.Dreamer` and :class:`~sb3_cpm.dreamer.Plan2Explore`, which document the arguments.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": DreamerPolicy,
+        "CnnPolicy": DreamerPolicy,
+        "MultiInputPolicy": DreamerPolicy,
+    }
+    #: which behaviour acts
+    behavior: ClassVar[str]
+    policy: DreamerPolicy
+
+    def __init__(
+        self,
+        policy: str | type[DreamerPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule | None,
+        buffer_size: int,
+        learning_starts: int,
+        train_freq: int | tuple[int, str],
+        gradient_steps: int,
+        action_noise: ActionNoise | None,
+        replay_buffer_class: type[ReplayBuffer] | None,
+        replay_buffer_kwargs: dict[str, Any] | None,
+        preset: str | Mapping[str, Any] | None,
+        entries: Mapping[str, Any],
+        keys: Sequence[str] | None,
+        start_from: StartFrom | None,
+        policy_kwargs: dict[str, Any] | None,
+        stats_window_size: int,
+        tensorboard_log: str | None,
+        verbose: int,
+        seed: int | None,
+        device: Any,
+        _init_setup_model: bool,
+    ):
+        source = None if start_from is None else read_challenger(start_from, choose_device(device))
+        if source is not None:
+            keys = source.keys if keys is None else keys
+            preset = {**source.preset, **(preset or {})} if not isinstance(preset, str) else preset
+        sizes = make_preset("default" if preset is None else preset, **entries)
+        super().__init__(
+            policy,
+            env,
+            sizes["model_lr"] if learning_rate is None else learning_rate,
+            buffer_size,
+            learning_starts,
+            sizes["batch_size"],
+            gamma=sizes["gamma"],
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs={"preset": sizes, "keys": keys, **(policy_kwargs or {}), "behavior": self.behavior},
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=choose_device(device),
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+        )
+        #: Recurrent state after the last action of ``learn()``; None before the first.
+        self._state: RecurrentState | None = None
+        self._random_state: RandomState | None = None
+        if _init_setup_model:
+            self._setup_model()
+            if source is not None:
+                self.challenger.adopt(source)
+
+    # ------------------------------------------------------------------ making
+
+    @property
+    def challenger(self) -> Challenger:
+        """World model, behaviours, uncertainty and optimizers."""
+        return self.policy.challenger
+
+    def _setup_model(self) -> None:
+        as_dict_space(self.observation_space)
+        check_action_space(self.action_space)
+        if self.replay_buffer is None:
+            self.replay_buffer = self._make_replay_buffer()
+        self.policy_kwargs["device"] = str(self.device)
+        super()._setup_model()
+
+    def _make_replay_buffer(self) -> EpisodeBuffer:
+        kind: Any = self.replay_buffer_class or CPMBuffer
+        if not (isinstance(kind, type) and issubclass(kind, EpisodeBuffer)):
+            raise ValueError(
+                f"{type(self).__name__} learns from sequences, which {kind} does not give. Leave `replay_buffer_class` away, or "
+                "use sb3_cpm.CPMBuffer or a subclass."
+            )
+        arguments = dict(self.replay_buffer_kwargs)
+        if issubclass(kind, CPMBuffer) and arguments.setdefault("challenge_ratio", 0) != 0:
+            raise ValueError(
+                f"replay_buffer_kwargs has challenge_ratio={arguments['challenge_ratio']}, but {type(self).__name__} has no player "
+                "to challenge: leave it away."
+            )
+        self.replay_buffer_class = kind
+        return kind(
+            self.buffer_size,
+            as_dict_space(self.observation_space),
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            **arguments,
+        )
+
+    # ------------------------------------------------------------------ acting
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self._random_state is not None and not reset_num_timesteps:
+            restore_random_state(self._random_state, self.action_space)
+            if self._last_obs is None and self.seed is not None and self.env is not None:
+                # the start states that come next, not once more those that the first run began with
+                self.env.seed(int(np.random.randint(2**31 - 1)))
+        self._random_state = None
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """:return: actions in the environment's units, and within [-1, 1] for the buffer"""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        assert isinstance(self.action_space, spaces.Box)
+        if self._state is None or len(self._state[0]) != n_envs:
+            self._state = self.policy.initial_state(n_envs)
+        latent = self.policy.follow(self._last_obs, self._state, self._last_episode_starts)
+        if self.num_timesteps < learning_starts:
+            actions = np.array([self.action_space.sample() for _ in range(n_envs)])
+            scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
+        else:
+            scaled = self.policy.act(latent)
+        if action_noise is not None:
+            scaled = np.clip(scaled + np.reshape(action_noise(), (-1, scaled.shape[1])), -1.0, 1.0)
+        if not np.isfinite(scaled).all():
+            self._refuse_nan()
+        self._state = self.policy.recurrent_state(latent, scaled)
+        shaped = scaled.reshape(n_envs, *self.action_space.shape)
+        # rounding must not leave the space
+        return np.clip(self.policy.unscale_action(shaped), self.action_space.low, self.action_space.high), shaped
+
+    def _refuse_nan(self) -> None:
+        assert self._last_obs is not None
+        for key, value in as_dict(self._last_obs).items():
+            if not np.isfinite(value).all():
+                raise ValueError(
+                    f"The environment gave NaN or infinite values in observation {key!r} at step {self.num_timesteps}. "
+                    "stable_baselines3.common.vec_env.VecCheckNan helps to find where they come from."
+                )
+        raise RuntimeError("The policy gave NaN for finite observations: its weights, or the action noise, are not finite.")
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        buffer: Any = replay_buffer if isinstance(self.observation_space, spaces.Dict) else Keyed(replay_buffer)
+        super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
+        """
+        Update world model and behaviours from the replay buffer. SB3's loop calls it; called directly, it learns offline from
+        whatever the buffer holds. Before the end of the first episode there is nothing to learn from, and nothing happens.
+
+        :param gradient_steps: number of updates
+        :param batch_size: sequences per update; the preset's by default
+        :raises RuntimeError: if a loss is not finite, naming the term
+        """
+        buffer = self.replay_buffer
+        assert isinstance(buffer, EpisodeBuffer)
+        if not buffer.episodes_ended:
+            return
+        self.policy.set_training_mode(True)
+        self._adapt_learning_rates()
+        for _ in range(gradient_steps):
+            batch = buffer.sample_sequences(
+                batch_size or self.batch_size, self.challenger.sequence_length, self.challenger.keys
+            )
+            for name, value in self.challenger.train(self._normalized(batch)).items():
+                self.logger.record_mean(f"train/{name}", value)
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _adapt_learning_rates(self) -> None:
+        """The world model's follows the schedule, all others keep the preset's ratio to it."""
+        rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
+        preset = self.challenger.preset
+        for name, optimizer in self.challenger.optimizers.items():
+            entry = {"world_model": "model_lr", "uncertainty": "uncertainty_lr"}.get(name, f"{name.split('_')[-1]}_lr")
+            for group in optimizer.adam.param_groups:
+                group["lr"] = rate * preset[entry] / preset["model_lr"]
+
+    def _normalized(self, batch: SequenceBatch) -> SequenceBatch:
+        """The buffer holds what the environment gave; behind a VecNormalize, what acts sees normalized observations."""
+        env = self._vec_normalize_env
+        if env is None:
+            return batch
+        observations: Any = batch.observations
+        if isinstance(self.observation_space, spaces.Dict):
+            normalized = env.normalize_obs({key: observations[key] for key in observations})
+        else:
+            normalized = {OBSERVATION: env.normalize_obs(observations[OBSERVATION])}
+        return batch._replace(observations=normalized, rewards=env.normalize_reward(batch.rewards))
+
+    # ------------------------------------------------------------------ saving and loading
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *(f"policy.{name}" for name in self.policy.optimizer_names)], []
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        As SB3's, and a file that is there already is replaced only by a complete one with finite weights.
+
+        :param path: of the file; ".zip" is appended to a name without extension
+        :param exclude: names of attributes to leave out, on top of SB3's
+        :param include: names of attributes to save although SB3 leaves them out
+        :raises RuntimeError: if a weight is not finite; the last good file is kept then
+        """
+        for name, network in self.challenger.networks.items():
+            check_finite(str(path), name, network.state_dict())
+        self._random_state = random_state(self.action_space)
+        try:
+            if not isinstance(path, (str, pathlib.Path)):
+                super().save(path, exclude, include)
+                return
+            target = pathlib.Path(path)
+            target = target if target.suffix else target.with_name(f"{target.name}.zip")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = target.with_name(f"{target.name}.{os.getpid()}.tmp")
+            try:
+                super().save(unfinished, exclude, include)
+                os.replace(unfinished, target)
+            finally:
+                unfinished.unlink(missing_ok=True)
+        finally:
+            self._random_state = None
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load what ``save_replay_buffer`` saved, of this model or of another one in the same environment.
+
+        :param path: of the file
+        :param truncate_last_traj: end an unfinished episode; False if the same episode goes on in the same environment
+        :raises ValueError: if it is no buffer of sequences, or belongs to another environment
+        """
+        buffer = load_from_pkl(path, self.verbose)
+        if not isinstance(buffer, EpisodeBuffer):
+            raise ValueError(f"{path} holds a {type(buffer).__name__}, {type(self).__name__} learns from a CPMBuffer.")
+        _check_buffer(buffer, self)
+        if truncate_last_traj:
+            buffer.truncate_last_trajectory()
+        buffer.device = self.device
+        self.replay_buffer = buffer
+
+
+class _Spaces:
+    """What the buffer's check reads of an environment."""
+
+    def __init__(self, model: BaseAlgorithm) -> None:
+        self.observation_space, self.action_space = as_dict_space(model.observation_space), model.action_space
+        self.num_envs = model.n_envs
+
+
+def _check_buffer(buffer: EpisodeBuffer, model: BaseAlgorithm) -> None:
+    """:raises ValueError: if the buffer was filled in environments of another kind or number"""
+    assert isinstance(buffer.observation_space, spaces.Dict)
+    check_environment(_Spaces(model), buffer.observation_space, buffer.action_space, buffer.n_envs)

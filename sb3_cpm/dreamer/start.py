@@ -1,0 +1,64 @@
+"""Where a model may start from: what another one, or a challenger beside a player, has learnt already."""
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_cpm.challenger import Challenger
+
+
+class HasChallenger(Protocol):
+    """A Dreamer, a Plan2Explore or a ChallengerCallback."""
+
+    @property
+    def challenger(self) -> Challenger | None: ...
+
+
+StartFrom = str | os.PathLike | Challenger | HasChallenger
+
+
+def read_challenger(source: StartFrom, device: th.device) -> Challenger:
+    """
+    :param source: a model saved by :class:`~sb3_cpm.dreamer.Plan2Explore` or :class:`~sb3_cpm.dreamer.Dreamer`, a challenger saved
+        by ``ChallengerCallback.save`` or ``Challenger.save``, or one of these objects
+    :param device: PyTorch device
+    :raises ValueError: for anything else, and for damaged files
+    """
+    if isinstance(source, Challenger):
+        return source
+    if not isinstance(source, (str, os.PathLike)):
+        challenger = getattr(source, "challenger", None)
+        if not isinstance(challenger, Challenger):
+            raise ValueError(
+                f"`start_from` must be a file, a Dreamer, a Plan2Explore or a Challenger, got {source!r}"
+                + (", which has no challenger yet." if hasattr(source, "challenger") else ".")
+            )
+        return challenger
+    path = Path(source)
+    if not path.exists() and path.with_name(f"{path.name}.zip").exists():
+        path = path.with_name(f"{path.name}.zip")
+    return _from_model(path, device) if _is_model(path) else Challenger.load(path, device)
+
+
+def _is_model(path: Path) -> bool:
+    """torch's own files are zip archives too, with other members than SB3's."""
+    if not path.is_file() or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"data", "policy.pth"} <= set(archive.namelist())
+
+
+def _from_model(path: Path, device: th.device) -> Challenger:
+    data, params, _ = load_from_zip_file(path, device=device)
+    if data is None or "behavior" not in data.get("policy_kwargs", {}):
+        raise ValueError(f"{path} is a model of another algorithm: `start_from` takes those of Dreamer and Plan2Explore.")
+    arguments: dict[str, Any] = {**data["policy_kwargs"], "device": device}
+    policy = data["policy_class"](data["observation_space"], data["action_space"], **arguments)
+    for name, state in params.items():
+        owner = policy if name == "policy" else getattr(policy, name.removeprefix("policy."))
+        owner.load_state_dict(state)
+    return policy.challenger
