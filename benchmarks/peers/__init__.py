@@ -1,0 +1,1 @@
+"""Other implementations that benchmarks compare with; each is driven as its own training loop drives it."""

@@ -1,0 +1,428 @@
+"""
+What the challenger costs: its world model, imagination and ensemble beside sheeprl's, its two kinds of latents beside each
+other, and its share of a run.
+
+::
+
+    pip install -c constraints.txt -e ".[run,maniskill]" sheeprl==0.8.4     # the peer; rows run without it, too
+    OMP_NUM_THREADS=1 python benchmarks/world_model.py                      # all rows, 15 minutes
+    OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 behavior --threads 1 --repeats 7
+    python benchmarks/world_model.py --device cuda                          # also with bfloat16 and torch.compile
+
+Contestants live in one process and take turns on the same batches, so that what else the machine does disturbs both alike;
+every number is the median over the turns, every ratio the median of the turns' ratios, after one turn that warms up. Ratios
+are of CPU seconds with one thread, and of wall time with more or on a GPU. Prints markdown tables; exits with 1 if a target is
+missed.
+
+Sizes: batches of 16 x 50, 7-dimensional actions, a 29-dimensional state beside the images, and the entries of
+:data:`CATEGORICAL`; the numbers of parameters are printed.
+"""
+
+import argparse
+import importlib.metadata
+import importlib.util
+import platform
+import statistics
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from clock import Clock, Enough, Lap, clocked, median, timed
+from gymnasium import spaces
+
+from sb3_cpm.challenger import Challenger
+from sb3_cpm.presets import make_preset
+from sb3_cpm.type_aliases import SequenceBatch
+
+ACTION_DIM, STATE_DIM = 7, 29
+PEER = importlib.util.find_spec("sheeprl") is not None
+#: DreamerV2's latents, everything else as in the report; 3 convolutions make 4x4 feature maps of 32x32 images
+CATEGORICAL: dict[str, Any] = {"latent": "categorical", "stoch_size": 32, "stoch_classes": 32}
+
+
+class Options(NamedTuple):
+    """
+    :param repeats: turns of every contestant
+    :param threads: numbers of torch threads
+    :param device: of the challenger and its peer
+    :param steps: of each run of the player
+    """
+
+    repeats: int
+    threads: list[int]
+    device: str
+    steps: int
+
+
+class Pair(NamedTuple):
+    """
+    What one row compares, measured turn by turn.
+
+    :param measure: what is measured
+    :param ours: laps of all turns
+    :param other: laps of all turns; empty if there is no peer
+    :param target: "at least so many times faster than the other", or with ``at_most`` the greatest share of it; None for
+        rows that inform
+    :param at_most: see ``target``
+    :param threads: torch threads
+    """
+
+    measure: str
+    ours: list[Lap]
+    other: list[Lap]
+    target: float | None
+    at_most: bool = False
+    threads: int = 1
+
+
+# ---------------------------------------------------------------------- contestants
+def make_space(size: int, cameras: int) -> spaces.Dict:
+    """So many cameras of ``size`` x ``size``, and a state vector."""
+    images = {f"camera{i}": spaces.Box(0, 255, (size, size, 3), np.uint8) for i in range(cameras)}
+    return spaces.Dict({**images, "state": spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)})
+
+
+def make_batch(space: spaces.Dict, preset: dict[str, Any]) -> SequenceBatch:
+    """Whole sequences of noise; what is in them does not change what they cost."""
+    rng = np.random.default_rng(0)
+    shape = preset["sequence_length"], preset["batch_size"]
+    observations = {
+        key: rng.integers(0, 256, (*shape, *sub.shape), dtype=np.uint8)
+        if sub.dtype == np.uint8
+        else rng.normal(size=(*shape, *sub.shape)).astype(np.float32)
+        for key, sub in space.items()
+        if sub.shape
+    }
+    is_first = np.zeros(shape, bool)
+    is_first[0] = True
+    actions = rng.uniform(-1, 1, (*shape, ACTION_DIM)).astype(np.float32) * ~is_first[..., None]
+    rewards = rng.uniform(size=shape).astype(np.float32) * ~is_first
+    return SequenceBatch(observations, actions, rewards, is_first, np.zeros(shape, bool), np.ones(shape, bool))
+
+
+class Ours:
+    """
+    A challenger whose updates are clocked as the peer's are: at the end of every optimizer's step, and of what follows the
+    ensemble's.
+
+    :param space: observation space
+    :param preset: complete preset
+    :param device: where it trains
+    """
+
+    def __init__(self, space: spaces.Dict, preset: dict[str, Any], device: str) -> None:
+        torch.manual_seed(0)
+        box = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self.challenger = Challenger(space, box, device, preset)
+
+    def train(self, batch: SequenceBatch, phases: int | None = None) -> list[Lap]:
+        """
+        One update, or its first phases.
+
+        :return: laps of the world model, then with an explorer of the ensemble's step, its scale, actor and critic, then with
+            a task those of actor and critic
+        """
+        laps: list[Lap] = []
+        ends: list[tuple[Any, str]] = [(optimizer, "step") for optimizer in self.challenger.optimizers.values()]
+        if self.challenger.explores:
+            ends.append((self.challenger.uncertainty, "adapt"))
+        clock = Clock(self.challenger.device)
+        with ExitStack() as stack, suppress(Enough):
+            for owner, name in ends:
+                stack.enter_context(patch.object(owner, name, clocked(getattr(owner, name), clock, laps, phases)))
+            self.challenger.train(batch)
+        return laps
+
+    def parameters(self) -> dict[str, int]:
+        """Numbers of parameters by the peer's names."""
+        parts: dict[str, torch.nn.Module] = {"world model": self.challenger.world_model}
+        if self.challenger.task is not None:
+            parts |= {"actor": self.challenger.task.actor, "critic": self.challenger.task.critic}
+        if self.challenger.explores:
+            parts["ensemble"] = self.challenger.uncertainty
+        return {name: sum(parameter.numel() for parameter in part.parameters()) for name, part in parts.items()}
+
+
+def make_peer(preset: dict[str, Any], space: spaces.Dict, **kwargs: Any) -> Any:
+    """sheeprl at the sizes of a preset; None if it is not installed."""
+    if not PEER:
+        return None
+    from peers.sheeprl_dreamer import SheeprlDreamer
+
+    return SheeprlDreamer(preset, space, ACTION_DIM, **kwargs)
+
+
+def print_sizes(what: str, ours: dict[str, int], peer: Any) -> None:
+    """
+    Print both sides' numbers of parameters.
+
+    :raises RuntimeError: if they differ by more than 0.1%: the comparison would not be fair
+    """
+    if peer is None:
+        return
+    print(f"{what}: parameters (sheeprl) " + ", ".join(f"{k} {ours[k]:,} ({n:,})" for k, n in peer.parameters.items()))
+    for name, number in peer.parameters.items():
+        if abs(ours[name] / number - 1.0) > 1e-3:
+            raise RuntimeError(f"{name}: {ours[name]:,} parameters against {number:,}")
+
+
+def variants(options: Options) -> Iterator[tuple[str, dict[str, bool]]]:
+    """Name and preset entries of what is measured: on GPUs also the fast switches."""
+    yield "", {}
+    if options.device != "cpu":
+        yield ", bf16 + compile", {"amp": True, "compile": True}
+
+
+def take_turns(
+    options: Options, ours: Callable[[], list[Lap]], other: Callable[[], list[Lap]] | None
+) -> Iterator[tuple[int, list[list[Lap]], list[list[Lap]]]]:
+    """
+    Let contestants work in turns, one more than asked for, to warm up.
+
+    :return: number of threads, then laps of all turns of ours, and of the other
+    """
+    found: dict[int, tuple[list[list[Lap]], list[list[Lap]]]] = {n: ([], []) for n in options.threads}
+    for turn in range(options.repeats + 1):
+        for threads, (mine, others) in found.items():
+            torch.set_num_threads(threads)
+            laps = [] if other is None else other(), ours()
+            if turn:
+                mine.append(laps[1])
+                others.extend([laps[0]] if other is not None else [])
+    torch.set_num_threads(1)
+    for threads, (mine, others) in found.items():
+        yield threads, mine, others
+
+
+def total(turns: list[list[Lap]], first: int, last: int | None = None) -> list[Lap]:
+    """Sum of some phases, of every turn."""
+    return [sum(laps[first:last][1:], laps[first:last][0]) for laps in turns]
+
+
+# ---------------------------------------------------------------------- rows
+def measure_dreamer(options: Options, size: int, cameras: int, target: float, behavior: bool, own: bool = False) -> list[Pair]:
+    """World model, and with ``behavior`` imagination with actor and critic."""
+    pairs = []
+    space = make_space(size, cameras)
+    for name, switches in variants(options):
+        preset = make_preset("report", **CATEGORICAL, **switches, cnn_layers=3 if size == 32 else 4)
+        preset |= {"train_task_behavior": True, "train_exploration_behavior": False}
+        ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
+        fast = {"amp": bool(switches), "compiled": bool(switches), "device": options.device}
+        peer = make_peer(preset, space, own_convolutions=own, **fast)
+        if not own:
+            print_sizes(f"{size}x{size}x{3 * cameras}", ours.parameters(), peer)
+        phases = None if behavior else 1
+        turns = take_turns(options, partial(ours.train, batch, phases), peer and partial(peer.train, batch, phases))
+        convolutions = ", sheeprl's own convolutions" if own else ""
+        target = target if options.device == "cpu" else 3.0
+        for threads, mine, others in turns:
+            what = f"world model, {size}x{size}x{3 * cameras} + state{convolutions}{name}"
+            pairs.append(Pair(what, total(mine, 0, 1), total(others, 0, 1), None if own else target, threads=threads))
+            if behavior:
+                what = f"imagination + actor-critic, 15 steps from 800 states{name}"
+                goal = 1.4 if options.device == "cpu" else 3.0
+                pairs.append(Pair(what, total(mine, 1), total(others, 1), goal, threads=threads))
+    return pairs
+
+
+def measure_model32(options: Options) -> list[Pair]:
+    return measure_dreamer(options, 32, 2, 1.7, behavior=True)
+
+
+def measure_model64(options: Options) -> list[Pair]:
+    return measure_dreamer(options, 64, 1, 1.6, behavior=False)
+
+
+def measure_own64(options: Options) -> list[Pair]:
+    """As it comes: convolutions without padding, fewer operations in the encoder and an embedding of 1024 instead of 4096."""
+    return measure_dreamer(options, 64, 1, 1.6, behavior=False, own=True) if PEER else []
+
+
+def measure_ensemble(options: Options) -> list[Pair]:
+    """Ten heads that predict the stochastic part, as sheeprl's do; ours with the adaptation of the scale that follows."""
+    pairs = []
+    space = make_space(32, 2)
+    heads = {"plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "stoch", "metric": "exp"}}
+    for name, switches in variants(options):
+        preset = make_preset("report", **CATEGORICAL, **switches, cnn_layers=3, uncertainty=heads)
+        ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
+        peer = make_peer(preset, space, ensemble=True, device=options.device, amp=bool(switches))
+        print_sizes("ensemble", ours.parameters(), peer)
+        turns = take_turns(options, partial(ours.train, batch, 3), peer and partial(peer.train, batch, 2))
+        for threads, mine, others in turns:
+            what = f"ensemble, 10 x (4 x 400){name}"
+            target = 1.4 if options.device == "cpu" else 3.0
+            pairs.append(Pair(what, total(mine, 1, 3), total(others, 1, 2), target, threads=threads))
+    return pairs
+
+
+def measure_latents(options: Options) -> list[Pair]:
+    """The whole update (world model, ensemble, explorer): the report's Gaussian latents beside our categorical ones."""
+    pairs = []
+    space = make_space(32, 2)
+    for name, switches in variants(options):
+        gaussian, categorical = make_preset("report", **switches), make_preset("report", **CATEGORICAL, **switches)
+        ours, other = Ours(space, gaussian, options.device), Ours(space, categorical, options.device)
+        batch = make_batch(space, gaussian)
+        for threads, mine, others in take_turns(options, partial(ours.train, batch), partial(other.train, batch)):
+            what = f"full update, Gaussian latents against categorical{name}"
+            pairs.append(Pair(what, total(mine, 0), total(others, 0), 2.5, threads=threads))
+    return pairs
+
+
+def measure_acting(options: Options) -> list[Pair]:
+    """C's share of a step, and what it takes to judge an episode, beside the simulator's steps with light rendering."""
+    from sb3_cpm.envs import make_maniskill_env
+
+    torch.set_num_threads(1)
+    env = make_maniskill_env("PickCube-v1")
+    space, n_steps = env.observation_space, 50
+    assert isinstance(space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
+    actions = np.random.default_rng(0).uniform(-1, 1, (n_steps, ACTION_DIM)).astype(np.float32)
+    episode: list[dict[str, np.ndarray]] = []
+
+    def simulate() -> None:
+        episode[:] = [env.reset(seed=0)[0]]
+        episode.extend(env.step(action)[0] for action in actions)
+
+    laps: dict[str, list[Lap]] = {}
+    challengers = {preset: Challenger(space, env.action_space, options.device, preset) for preset in ("default", "report")}
+    for turn in range(options.repeats + 1):
+        found = {"simulate": timed(simulate)}
+        for preset, challenger in challengers.items():
+            arrays = {key: np.stack([state[key] for state in episode]) for key in challenger.keys}
+            found[f"{preset} judge"] = timed(partial(challenger.evaluate, arrays, actions), options.device)
+            for n in (1, 8):
+                act = _acting(challenger, arrays, actions, n)
+                found[f"{preset} act {n}"] = timed(act, options.device)
+        for key, lap in found.items() if turn else ():
+            laps.setdefault(key, []).append(lap)
+    env.close()
+    step = [Lap(cpu / n_steps, wall / n_steps) for cpu, wall in laps["simulate"]]
+    pairs = []
+    for preset in challengers:
+        informs = preset != "default"
+        for n in (1, 8):
+            mine = [Lap(cpu / n_steps, wall / n_steps) for cpu, wall in laps[f"{preset} act {n}"]]
+            what = f"C acts in {n} environment(s) at once, preset {preset}, against one environment's step"
+            pairs.append(Pair(what, mine, step, None if informs else 0.25, at_most=True))
+        what = f"C judges an episode of {n_steps} steps, preset {preset}, against the steps"
+        pairs.append(Pair(what, laps[f"{preset} judge"], laps["simulate"], None if informs else 0.05, at_most=True))
+    return pairs
+
+
+def _acting(challenger: Challenger, arrays: dict[str, np.ndarray], actions: np.ndarray, n: int) -> Callable[[], None]:
+    """An episode in ``n`` environments at once: encode, follow, act, step by step."""
+    rows = [{key: np.stack([value[t]] * n)[None] for key, value in arrays.items()} for t in range(len(actions))]
+    first = np.zeros((1, n), bool)
+
+    def run() -> None:
+        state = challenger.initial_state(n)
+        action = np.zeros((n, challenger.action_dim), np.float32)
+        for row in rows:
+            state = challenger.follow(state, row, action[None], first)
+            action = challenger.act(state)
+
+    return run
+
+
+def measure_run(options: Options) -> list[Pair]:
+    """PickCube-v1 on state vectors: SAC with SB3's own settings, an update per step, and the same with a challenger."""
+    from stable_baselines3 import SAC
+
+    from sb3_cpm import ChallengerCallback, CPMBuffer
+    from sb3_cpm.envs import make_maniskill_env
+
+    torch.set_num_threads(1)
+    laps: dict[bool, list[Lap]] = {True: [], False: []}
+    for turn in range(options.repeats + 1):
+        for cpm, found in laps.items():
+            env = make_maniskill_env("PickCube-v1", obs_mode="state")
+            kwargs: dict[str, Any] = {"replay_buffer_class": CPMBuffer} if cpm else {}
+            model = SAC("MultiInputPolicy", env, learning_starts=100, seed=turn, device=options.device, **kwargs)
+            steps, callback = options.steps if turn else 150, ChallengerCallback() if cpm else None
+            lap = timed(partial(model.learn, steps, callback=callback), options.device)
+            found.extend([Lap(lap.cpu / steps, lap.wall / steps)] if turn else [])
+            env.close()
+    what = f"a step of CPM-SAC, PickCube-v1 state, {options.steps} steps and updates, against SAC"
+    return [Pair(what, laps[True], laps[False], 1.5, at_most=True)]
+
+
+ROWS: dict[str, Callable[[Options], list[Pair]]] = {
+    "model32": measure_model32,
+    "model64": measure_model64,
+    "own64": measure_own64,
+    "ensemble": measure_ensemble,
+    "latents": measure_latents,
+    "acting": measure_acting,
+    "run": measure_run,
+}
+
+
+# ---------------------------------------------------------------------- report
+def print_pair(pair: Pair, by_wall: bool) -> bool:
+    """
+    :param pair: a row
+    :param by_wall: judge wall time instead of CPU time
+    :return: whether the target is met
+    """
+    mine = median(pair.ours)
+    if not pair.other:
+        print(f"| {pair.measure} | {pair.threads} | {_seconds(mine.cpu)} | | | {_seconds(mine.wall)} | | | | not compared |")
+        return True
+    other = median(pair.other)
+    ratios = Lap(
+        *(
+            statistics.median(a[i] / b[i] if pair.at_most else b[i] / a[i] for a, b in zip(pair.ours, pair.other, strict=True))
+            for i in range(2)
+        )
+    )
+    judged = ratios.wall if by_wall or pair.threads > 1 else ratios.cpu
+    met = pair.target is None or (judged <= pair.target if pair.at_most else judged >= pair.target)
+    form: Callable[[float], str] = "{:.1%}".format if pair.at_most and pair.target != 1.5 else "{:.2f}".format
+    target = "" if pair.target is None else f"{'at most' if pair.at_most else 'at least'} {pair.target:g}"
+    verdict = "" if pair.target is None else "met" if met else "MISSED"
+    cells = [pair.measure, str(pair.threads), _seconds(mine.cpu), _seconds(other.cpu), form(ratios.cpu)]
+    cells += [_seconds(mine.wall), _seconds(other.wall), form(ratios.wall), target, verdict]
+    print("| " + " | ".join(cells) + " |", flush=True)
+    return met
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2f} s" if value >= 1.0 else f"{1e3 * value:.3g} ms"
+
+
+def main() -> int:
+    """:return: exit status, 1 if a target is missed"""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--repeats", type=int, default=5, help="turns of every contestant, after one that warms up")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of torch threads")
+    parser.add_argument("--steps", type=int, default=500, help="environment steps of each turn of a run")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    threads = arguments.threads if arguments.device == "cpu" else [1]
+    options = Options(arguments.repeats, threads, arguments.device, arguments.steps)
+    torch.set_float32_matmul_precision("high")  # sheeprl's default, for both
+
+    peer = f"sheeprl {importlib.metadata.version('sheeprl')}" if PEER else "sheeprl is not installed (see --help)"
+    where = platform.processor() or platform.machine()
+    where = where if options.device == "cpu" else torch.cuda.get_device_name(options.device)
+    print(f"Peer: {peer}; torch {torch.__version__}; {where}; medians of {options.repeats} turns\n")
+    pairs = [pair for row in arguments.rows for pair in ROWS[row](options)]
+    print("\n| measure | threads | CPU ours | other | ratio | wall ours | other | ratio | target | |")
+    print("| --- " * 10 + "|")
+    met = [print_pair(pair, by_wall=options.device != "cpu") for pair in pairs]
+    if options.device != "cpu":
+        print("\nUpdates per second: " + "; ".join(f"{pair.measure} {1 / median(pair.ours).wall:.1f}" for pair in pairs))
+    return int(not all(met))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
