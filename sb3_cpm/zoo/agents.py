@@ -10,8 +10,6 @@ overridden in depth, and nothing is written.
 import argparse
 import contextlib
 import copy
-import difflib
-import inspect
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,27 +17,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cpm.buffers import CPMBuffer
-
-#: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
-ZOO_KEYS = (
-    "n_timesteps",
-    "n_envs",
-    "env_kwargs",
-    "env_wrapper",
-    "vec_env_wrapper",
-    "normalize",
-    "frame_stack",
-    "callback",
-    "monitor_kwargs",
-    "noise_type",
-    "noise_std",
-)
+from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, nearest, read_entries
 
 
 class Built(NamedTuple):
@@ -127,7 +109,6 @@ class Agent:
         """rl_zoo3's manager, and the arguments of the algorithm as it has read them."""
         from rl_zoo3 import exp_manager
 
-        vars(exp_manager).setdefault("CPMBuffer", CPMBuffer)  # what `replay_buffer_class: CPMBuffer` is evaluated in
         manager = _quietly(
             exp_manager.ExperimentManager,
             argparse.Namespace(),
@@ -163,15 +144,9 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     """
     path = find_config(name_or_path)
     ensure_registered(env_id)
-    entries = _read(path)
-    if env_id not in entries and "default" not in entries:
-        raise ValueError(f"{path} has neither an entry {env_id!r} nor a default. It has {', '.join(map(repr, entries))}.")
-    found = entries.get(env_id, entries.get("default"))
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: the entry of {env_id} must be a mapping of hyperparameters, got {found!r}.")
-    merged = merge(found, overrides or {})
+    merged = merge(find_entry(read_entries(path), env_id, path), overrides or {})
     algo = algorithm_of(path.stem)
-    _check_keys(merged, algo, path, env_id)
+    check_hyperparameters(merged, algo, env_id, path)
     return Agent(path.stem, algo, env_id, merged, path)
 
 
@@ -208,13 +183,6 @@ def find_config(name_or_path: str | Path) -> Path:
     return folder / f"{name_or_path}.yml"
 
 
-def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """:return: rl_zoo3's algorithms by name, and ours where they are registered"""
-    from rl_zoo3.utils import ALGOS
-
-    return ALGOS
-
-
 def algorithm_of(name: str) -> str:
     """
     The algorithm that a file is for: the one that is a part of its name.
@@ -248,23 +216,7 @@ def ensure_registered(env_id: str) -> None:
         raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
 
 
-def nearest(name: str, valid: list[str]) -> str:
-    """:return: a sentence with the most similar name, "" where nothing is"""
-    matches = difflib.get_close_matches(name, valid, n=1, cutoff=0.4)
-    return f" Did you mean {matches[0]!r}?" if matches else ""
-
-
 # ---------------------------------------------------------------------- reading
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
-    if not isinstance(entries, dict):
-        raise ValueError(f"{path}: expected hyperparameters by environment, got {type(entries).__name__}.")
-    return entries
 
 
 def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -282,18 +234,6 @@ def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
         else:
             result[key] = copy.deepcopy(value)
     return result
-
-
-def _check_keys(hyperparameters: Mapping[str, Any], algo: str, path: Path, env_id: str) -> None:
-    """A misspelt key would otherwise surface as a TypeError of some constructor, after the environments are made."""
-    arguments = set(inspect.signature(algorithms()[algo].__init__).parameters) - {"self", "env", "seed", "device"}
-    valid = sorted({*arguments, *ZOO_KEYS})
-    for key in hyperparameters:
-        if key not in valid:
-            raise ValueError(f"{path}, {env_id}: unknown key {key!r}.{nearest(key, valid)} Valid: {', '.join(valid)}.")
-    missing = {"policy", "n_timesteps"} - set(hyperparameters)
-    if missing:
-        raise ValueError(f"{path}, {env_id}: {' and '.join(sorted(missing))} must be there.")
 
 
 def _quietly(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
