@@ -221,16 +221,18 @@ def draw(path: Path, challenger: Challenger, episode: Recorded, rows: list[dict[
     inputs = {key: episode.observations[key] for key in challenger.keys}
     seen = challenger.open_loop(inputs, episode.actions, STEPS + 1).observations
     dreamt = challenger.open_loop(inputs, episode.actions, CONTEXT).observations
-    columns = [0, CONTEXT - 1, *range(8, STEPS, 6)]
+    columns = [0, CONTEXT - 1, *range(8, STEPS + 1, 6)]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(3, 1, figsize=(11, 9.6), height_ratios=(6.0, 2.2, 2.2), layout="constrained")
         films = [pictures[key] for key in CAMERAS for pictures in (episode.observations, seen, dreamt)]
         strip = [np.concatenate([np.clip(film[t], 0, 255).astype(np.uint8) for t in columns], axis=1) for film in films]
         axes[0].imshow(np.concatenate(strip), interpolation="nearest")
-        axes[0].set_yticks(16 + 32 * np.arange(6), ["truth", "reconstruction", f"open loop after {CONTEXT} states"] * 2)
+        axes[0].set_yticks(16 + 32 * np.arange(6), ["truth", "reconstruction", "open loop"] * 2)
         axes[0].set_xticks(16 + 32 * np.arange(len(columns)), [str(t) for t in columns])
         axes[0].grid(False)
-        axes[0].set_title(f"A held-out episode: base camera, hand camera; below the step (preset {rows[0]['preset']})")
+        axes[0].set_title(
+            f"A held-out episode, preset {rows[0]['preset']}; open loop: {CONTEXT} states seen, then only actions"
+        )
         curves = ("pixel_error", "open_loop_pixel_error"), ("pixel_error_mean_image", "open_loop_pixel_error_last_image")
         _curves(axes[1], rows, *curves, "absolute pixel error")
         axes[1].axhline(0.1, color=GREY, lw=1)
