@@ -230,9 +230,7 @@ def draw(path: Path, challenger: Challenger, episode: Recorded, rows: list[dict[
         axes[0].set_yticks(16 + 32 * np.arange(6), ["truth", "reconstruction", "open loop"] * 2)
         axes[0].set_xticks(16 + 32 * np.arange(len(columns)), [str(t) for t in columns])
         axes[0].grid(False)
-        axes[0].set_title(
-            f"A held-out episode, preset {rows[0]['preset']}; open loop: {CONTEXT} states seen, then only actions"
-        )
+        axes[0].set_title(f"A held-out episode, preset {rows[0]['preset']}; open loop: {CONTEXT} states seen, then actions")
         curves = ("pixel_error", "open_loop_pixel_error"), ("pixel_error_mean_image", "open_loop_pixel_error_last_image")
         _curves(axes[1], rows, *curves, "absolute pixel error")
         axes[1].axhline(0.1, color=GREY, lw=1)
