@@ -92,7 +92,7 @@ class Challenger:
 
     @property
     def explores(self) -> bool:
-        """Whether it has a novelty measure and an exploration behaviour; ``train_exploration_behavior=False`` leaves them out."""
+        """Whether it has uncertainty and an exploration behaviour; ``train_exploration_behavior=False`` leaves them out."""
         return self._exploration is not None
 
     @property

@@ -356,3 +356,72 @@ def test_the_report_preset_has_the_reports_sizes() -> None:
     assert model.encoder.cnn is not None and model.encoder.cnn.output_dim == 32 * 32
     assert challenger.uncertainty.ensemble.heads == 10
     assert (challenger.batch_size, challenger.sequence_length) == (16, 50)
+
+
+# ---- leaving out what is not needed, starting from another one -------------------------------------------------------------
+
+
+def test_without_exploration_it_follows_plays_and_learns_the_task_only() -> None:
+    lean = small(train_exploration_behavior=False, train_task_behavior=True)
+    assert not lean.explores and list(lean.behaviors) == ["task"] and list(lean.networks) == ["world_model", "task"]
+    assert list(lean.optimizers) == ["world_model", "task_actor", "task_critic"]
+    metrics = lean.train(random_batch(VECTOR, 2))
+    assert "task_actor_loss" in metrics and not any("exploration" in name or "uncertainty" in name for name in metrics)
+    assert lean.act(lean.initial_state(3), behavior="task").shape == (3, 2)
+    batch = random_batch(VECTOR, 2)
+    episode = {key: value[:, 0] for key, value in batch.observations.items()}, batch.actions[1:, 0]
+    for call in (lambda: lean.act(lean.initial_state(1)), lambda: lean.evaluate(*episode), lambda: lean.exploration):
+        with pytest.raises(ValueError, match="train_exploration_behavior"):
+            call()
+
+
+def test_a_lean_challenger_is_saved_and_loaded(tmp_path: pathlib.Path) -> None:
+    lean = small(train_exploration_behavior=False, train_task_behavior=True)
+    lean.train(random_batch(VECTOR, 2))
+    lean.save(tmp_path / "lean.pt")
+    loaded = Challenger.load(tmp_path / "lean.pt", device="cpu")
+    assert all(np.array_equal(value, weights(loaded)[key]) for key, value in weights(lean).items())
+    with pytest.raises(ValueError, match="no weight uncertainty"):
+        small(train_task_behavior=True).load_state(tmp_path / "lean.pt")
+
+
+def test_acting_for_the_task_and_acting_for_novelty_are_two_behaviors() -> None:
+    challenger = small(train_task_behavior=True)
+    state = challenger.initial_state(2)
+    explores, plays = (challenger.act(state, deterministic=True, behavior=name) for name in ("exploration", "task"))
+    assert not np.array_equal(explores, plays)
+    assert np.array_equal(challenger.act(state, deterministic=True), explores), "a challenger explores unless told otherwise"
+    with pytest.raises(ValueError, match="train_task_behavior"):
+        small().act(small().initial_state(1), behavior="task")
+
+
+def test_adopting_takes_what_both_have_and_shares_nothing() -> None:
+    first, second = small(), small(train_task_behavior=True, model_lr=0.5)
+    first.train(random_batch(VECTOR, 2))
+    task = weights(second)
+    assert second.adopt(first) == ("world_model", "uncertainty", "exploration") and second.trained_updates == 1
+    mine, theirs = weights(second), weights(first)
+    assert all(np.array_equal(mine[key], value) for key, value in theirs.items())
+    assert all(np.array_equal(mine[key], value) for key, value in task.items() if key.startswith("task."))
+    assert second.optimizers["world_model"].adam.param_groups[0]["lr"] == 0.5
+    second.train(random_batch(VECTOR, 2, seed=1))
+    assert all(np.array_equal(weights(first)[key], value) for key, value in theirs.items())
+    moments = [one.optimizers["world_model"].adam.state_dict()["state"][0]["exp_avg"] for one in (first, second)]
+    assert not torch.equal(*moments)
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        ({"space": spaces.Dict({"state": vector(4)})}, "reads the observations"),
+        ({"actor_units": 17}, r"exploration\.actor\.net\.0\.weight"),
+        ({"action_dim": 3}, "other sizes"),
+        ({"uncertainty_class": "rnd"}, "has the uncertainty rnd"),
+    ],
+)
+def test_adopting_from_a_stranger_changes_nothing(kwargs: dict, message: str) -> None:
+    mine = small()
+    before = weights(mine)
+    with pytest.raises(ValueError, match=message):
+        mine.adopt(small(**kwargs))
+    assert all(np.array_equal(value, before[key]) for key, value in weights(mine).items())

@@ -129,14 +129,14 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         kind: Any = self.replay_buffer_class or CPMBuffer
         if not (isinstance(kind, type) and issubclass(kind, EpisodeBuffer)):
             raise ValueError(
-                f"{type(self).__name__} learns from sequences, which {kind} does not give. Leave `replay_buffer_class` away, or "
-                "use sb3_cpm.CPMBuffer or a subclass."
+                f"{type(self).__name__} learns from sequences, which {kind} does not give. Leave `replay_buffer_class` away, "
+                "or use sb3_cpm.CPMBuffer or a subclass."
             )
         arguments = dict(self.replay_buffer_kwargs)
         if issubclass(kind, CPMBuffer) and arguments.setdefault("challenge_ratio", 0) != 0:
             raise ValueError(
-                f"replay_buffer_kwargs has challenge_ratio={arguments['challenge_ratio']}, but {type(self).__name__} has no player "
-                "to challenge: leave it away."
+                f"replay_buffer_kwargs has challenge_ratio={arguments['challenge_ratio']}, but {type(self).__name__} has no "
+                "player to challenge: leave it away."
             )
         self.replay_buffer_class = kind
         return kind(
@@ -254,8 +254,9 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if env is None:
             return batch
         observations: Any = batch.observations
+        normalized: Any
         if isinstance(self.observation_space, spaces.Dict):
-            normalized = env.normalize_obs({key: observations[key] for key in observations})
+            normalized = env.normalize_obs(observations)
         else:
             normalized = {OBSERVATION: env.normalize_obs(observations[OBSERVATION])}
         return batch._replace(observations=normalized, rewards=env.normalize_reward(batch.rewards))

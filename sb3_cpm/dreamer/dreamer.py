@@ -25,13 +25,14 @@ class Dreamer(DreamerAlgorithm):
         model.learn(10_000)
         action, state = model.predict(obs, state, episode_start, deterministic=True)
 
-    :param policy: "MlpPolicy", "CnnPolicy" or "MultiInputPolicy", as SB3 users expect; the observation space alone decides what
-        is built, images and vectors may be mixed in a Dict
+    :param policy: "MlpPolicy", "CnnPolicy" or "MultiInputPolicy", as SB3 users expect; the observation space alone decides
+        what is built, and a Dict may mix images and vectors
     :param env: environment, or a name registered in gymnasium
     :param learning_rate: of the world model, a number or a function of the remaining progress; the preset's by default. The
         other learning rates keep the preset's ratios to it
     :param buffer_size: number of transitions to keep
-    :param learning_starts: random steps at the beginning, over all environments. Learning waits for the end of the first episode
+    :param learning_starts: random steps at the beginning, over all environments. Learning also waits for the first
+        episode to end
     :param train_freq: steps (of each environment) between two rounds of updates, or ``(n, "episode")``
     :param gradient_steps: updates per round; -1: as many as transitions were collected
     :param action_noise: added to the actions of ``learn()`` within [-1, 1]; the policy is stochastic without it

@@ -1,5 +1,5 @@
 """
-Plan2Explore as an SB3 algorithm (Sekar et al. 2020; report, B.2): acts where its world model expects to learn, whatever the task.
+Plan2Explore as an SB3 algorithm (Sekar et al. 2020; report, B.2): acts where its world model will learn something new.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,15 +20,15 @@ class Plan2Explore(DreamerAlgorithm):
     """
     Explores without reward: acts with a behaviour that climbs the novelty of imagined transitions.
 
-    Rewards never influence how it acts. The world model still learns to predict them, so that
-    :class:`~sb3_cpm.dreamer.Dreamer` can turn to the task afterwards; with ``train_task_behavior=True`` a behaviour for the task
-    is learnt along the way, in imagination only::
+    It does not act for rewards. The world model still learns to predict them, so that :class:`~sb3_cpm.dreamer.Dreamer` can
+    turn to the task afterwards; with ``train_task_behavior=True`` a behaviour for the task is learnt along the way, in
+    imagination only::
 
         explorer = Plan2Explore("MlpPolicy", env, train_task_behavior=True).learn(10_000)
         explorer.save("explorer")
         model = Dreamer("MlpPolicy", env, start_from="explorer.zip").learn(5_000)
 
-    (To keep the novelty out of everything but acting, ``preset={"reward_gradient": False}`` shapes the latents without rewards.)
+    Predicting rewards shapes the latents, and by that a little of what is new; ``preset={"reward_gradient": False}`` ends it.
 
     :param policy: as for Dreamer
     :param env: as for Dreamer

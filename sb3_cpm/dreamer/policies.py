@@ -55,7 +55,7 @@ class DreamerPolicy(BasePolicy):
     ):
         super().__init__(observation_space, action_space, squash_output=True)
         self.behavior = behavior
-        self.arguments = {
+        self.arguments: dict[str, Any] = {
             "preset": preset,
             "keys": keys,
             "uncertainty_class": uncertainty_class,

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-#: Key under which the world model and the buffer know the observation of an environment with a Box space.
-OBSERVATION = "observation"
+#: Key under which world model and buffer know the observation of an environment with a Box space; the one that
+#: ``sb3_cpm.envs.DictObservation`` gives, so that models and buffers of the wrapped environment fit the bare one.
+OBSERVATION = "state"
 
 
 def as_dict_space(space: spaces.Space) -> spaces.Dict:

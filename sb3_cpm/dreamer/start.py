@@ -23,8 +23,8 @@ StartFrom = str | os.PathLike | Challenger | HasChallenger
 
 def read_challenger(source: StartFrom, device: th.device) -> Challenger:
     """
-    :param source: a model saved by :class:`~sb3_cpm.dreamer.Plan2Explore` or :class:`~sb3_cpm.dreamer.Dreamer`, a challenger saved
-        by ``ChallengerCallback.save`` or ``Challenger.save``, or one of these objects
+    :param source: a model saved by :class:`~sb3_cpm.dreamer.Plan2Explore` or :class:`~sb3_cpm.dreamer.Dreamer`, a challenger
+        saved by ``ChallengerCallback.save`` or ``Challenger.save``, or one of these objects
     :param device: PyTorch device
     :raises ValueError: for anything else, and for damaged files
     """
