@@ -15,7 +15,8 @@ from typing import Any
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
-from sb3_cpm.zoo import manager, search
+from sb3_cpm.zoo.manager import install as wrap_manager
+from sb3_cpm.zoo.search import install as add_search_spaces
 
 NAMES: dict[str, Any] = {
     "CPMBuffer": CPMBuffer,
@@ -39,5 +40,5 @@ def install() -> None:
 
     vars(rl_zoo3.exp_manager).update(NAMES)
     ALGOS.update(ALGORITHMS)
-    search.install()
-    manager.install()
+    add_search_spaces()
+    wrap_manager()

@@ -9,6 +9,7 @@ rl_zoo3 starts ``-i`` at step 0, so it would repeat the random actions of ``lear
 """
 
 import contextlib
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,8 @@ def kept(manager: Any, model: BaseAlgorithm) -> Iterator[Any]:
     challengers = [callback for callback in manager.callbacks if isinstance(callback, ChallengerCallback)]
     if manager.continue_training:
         _go_on(Path(manager.trained_agent), model, challengers)
+        # not once more the start states and random numbers that the first run began with
+        model.set_random_seed(manager.seed + model.num_timesteps)
     if manager.save_freq > 0:
         manager.callbacks.append(_Checkpoints(folder, manager.save_freq, challengers, manager.save_replay_buffer))
     try:
@@ -56,9 +59,9 @@ class _Continued:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._model, name)
 
-    def learn(self, *args: Any, **kwargs: Any) -> BaseAlgorithm:
+    def learn(self, total_timesteps: int, **kwargs: Any) -> BaseAlgorithm:
         """As SB3's, with ``reset_num_timesteps=False``."""
-        return self._model.learn(*args, reset_num_timesteps=False, **kwargs)
+        return self._model.learn(total_timesteps, reset_num_timesteps=False, **kwargs)
 
 
 class _Checkpoints(BaseCallback):
@@ -137,4 +140,4 @@ def challenger_file(trained_agent: Path) -> Path | None:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)  # noqa: T201  (beside what rl_zoo3 prints)
+    sys.stdout.write(f"{text}\n")  # beside what rl_zoo3 prints

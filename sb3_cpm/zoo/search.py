@@ -3,7 +3,7 @@ Search spaces for ``--optimize``: rl_zoo3's for the player, and ours for what CP
 
 rl_zoo3 asks a function per algorithm for hyperparameters of a trial, replaces ``policy_kwargs`` and ``replay_buffer_kwargs``
 by what it says, and has no place for arguments of callbacks. So our part is sampled around ``ExperimentManager.objective``, on
-a copy of the manager (trials may run in threads), and ``policy_kwargs`` of the configuration stay where the trial says nothing.
+a copy of the manager (trials may run in threads), and ``policy_kwargs`` of the configuration stay where a trial is silent.
 """
 
 import contextlib
@@ -225,5 +225,5 @@ def _sample_dreamer(trial: Any, n_actions: int, n_envs: int, additional_args: di
     return {**converted, "preset": {**(preset or {}), **converted["preset"]}}
 
 
-def _convert_dreamer(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    return _placed({}, {WORLD_MODEL_SPACE[name].place: value for name, value in parameters.items()})
+def _convert_dreamer(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    return _placed({}, {WORLD_MODEL_SPACE[name].place: value for name, value in sampled_params.items()})

@@ -1,0 +1,88 @@
+"""
+rl_zoo3's commands, with our algorithms among the choices of ``--algo`` and our environments registered::
+
+    python -m sb3_cpm.zoo train --algo dreamer --env CPM/PickCube-v1
+    python -m sb3_cpm.zoo train --agent cpm_sac --env CPM/PickCube-v1
+    python -m sb3_cpm.zoo enjoy --algo dreamer --env CPM/PickCube-v1 --no-render
+
+All options are rl_zoo3's own but one: ``--agent NAME`` stands for ``--algo ALGO --conf-file zoo_configs/NAME.yml``. And
+``train --algo dreamer`` or ``plan2explore`` without ``--conf-file`` takes the file of that name, since rl_zoo3 has none.
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+#: Commands, and the module and function where rl_zoo3 has them; a module without a function is a script.
+COMMANDS = {
+    "train": "rl_zoo3.train:train",
+    "enjoy": "rl_zoo3.enjoy:enjoy",
+    "record_video": "rl_zoo3.record_video:",
+    "plot_train": "rl_zoo3.plots:plot_train",
+    "plot_from_file": "rl_zoo3.plots:plot_from_file",
+    "all_plots": "rl_zoo3.plots:all_plots",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param arguments: of the command line, without the program's name; None for those of this process
+    :return: exit status: 0 if all is well, 1 for errors that a message explains, 2 for a wrong command
+    """
+    command, *rest = list(sys.argv[1:] if arguments is None else arguments) or [""]
+    if command not in COMMANDS:
+        wants_help = command in ("", "-h", "--help")
+        usage = f"usage: python -m sb3_cpm.zoo COMMAND ..., one of: {', '.join(COMMANDS)}\n"
+        (sys.stdout if wants_help else sys.stderr).write(usage)
+        return 0 if wants_help else 2
+    try:
+        import rl_zoo3  # noqa: F401
+    except ImportError as error:
+        sys.stderr.write(f'error: rl_zoo3 is missing ({error}): pip install "sb3_cpm[zoo]"\n')
+        return 1
+    try:
+        sys.argv = [f"{sys.argv[0]} {command}", *complete(command, rest)]
+        _run(COMMANDS[command])
+    except ValueError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
+    return 0
+
+
+def _run(place: str) -> None:
+    module_name, _, function = place.partition(":")
+    if function:
+        getattr(importlib.import_module(module_name), function)()
+    else:  # a script
+        import runpy
+
+        runpy.run_module(module_name, run_name="__main__")
+
+
+def complete(command: str, arguments: Sequence[str]) -> list[str]:
+    """
+    :param command: one of :data:`COMMANDS`
+    :param arguments: of the command line
+    :return: the same with what rl_zoo3 needs in place of what we allow
+    :raises ValueError: for an agent that does not exist
+    """
+    from sb3_cpm.zoo.agents import algorithm_of, find_config
+
+    completed = list(arguments)
+    if "--agent" in completed:
+        at = completed.index("--agent")
+        if at + 1 == len(completed):
+            raise ValueError("--agent needs the name of a file in zoo_configs/, or a path.")
+        path = find_config(completed[at + 1])
+        of_agent = ["--algo", algorithm_of(path.stem)]
+        completed[at : at + 2] = [*of_agent, "--conf-file", str(path)] if command == "train" else of_agent
+    algo = completed[completed.index("--algo") + 1] if "--algo" in completed[:-1] else ""
+    if command == "train" and algo in ("dreamer", "plan2explore") and not {"-conf", "--conf-file"} & set(completed):
+        completed += ["--conf-file", str(find_config(algo))]
+    return completed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
