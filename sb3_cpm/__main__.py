@@ -1,5 +1,5 @@
 """
-The command line: ``python -m sb3_cpm train | doctor | setup-rendering | assets``.
+The command line: ``python -m sb3_cpm train | watch | reproduce | doctor | setup-rendering | assets``.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -20,6 +20,7 @@ EPILOG = """examples:
   python -m sb3_cpm train --env Pendulum-v1 --algorithm td3     any gymnasium task with continuous actions
   python -m sb3_cpm train --env-kwargs image_size=64 cameras=[base_camera]
   python -m sb3_cpm watch runs/PickCube-v1-sac-seed0            what the world model of a run believes it will see
+  python -m sb3_cpm reproduce --figure 4 --quick                an experiment of the report
 """
 CHOICES = {"algorithm": ALGORITHMS, "unit": ("step", "segment", "episode")}
 TYPES = {"steps": int, "gamma": float, "tau": float, "buffer_size": int, "learning_starts": int}
@@ -73,6 +74,24 @@ def make_parser() -> argparse.ArgumentParser:
     watch.add_argument("--frames", type=int, default=50, help="states in all, at most 64 (default: 50)")
     watch.add_argument("--device", default="auto", help="PyTorch device (default: auto)")
     watch.set_defaults(command=_watch)
+
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="run an experiment of the report and draw its figure",
+        description="Run the agents, tasks and seeds that a figure of the report needs, skip what is there, go on with what "
+        "was cut off, and draw the figure from the CSV files below the folder of results.",
+    )
+    which = reproduce.add_mutually_exclusive_group(required=True)
+    which.add_argument("--figure", metavar="N|NAME", help="number of the report's figure, or name of an experiment")
+    which.add_argument("--list", action="store_true", help="all experiments with their cost")
+    reproduce.add_argument("--quick", action="store_true", help="a version that takes minutes on two cores")
+    reproduce.add_argument("--seeds", type=int, help="how many, from 0 (default: as planned)")
+    reproduce.add_argument("--steps", type=int, help="of each run, to try something (default: as planned)")
+    reproduce.add_argument("--jobs", type=int, default=1, help="processes at a time; 0: in this process (default: 1)")
+    reproduce.add_argument("--results", default="results", help="folder of all results (default: results)")
+    reproduce.add_argument("--draw-only", action="store_true", help="run nothing, draw what is there")
+    reproduce.add_argument("--device", default="cpu", help="PyTorch device (default: cpu)")
+    reproduce.set_defaults(command=_reproduce)
 
     doctor = commands.add_parser("doctor", help="what works on this machine, and the cure for what doesn't")
     doctor.set_defaults(command=_doctor)
@@ -157,6 +176,18 @@ def _watch(**arguments: Any) -> int:
     print(watched.text)
     print("\nDrawn: " + ", ".join(str(file) for file in watched.files))
     return 0
+
+
+def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
+    try:
+        from sb3_cpm import experiments
+    except ImportError as error:
+        cure = 'pip install "sb3_cpm[experiments]"'
+        raise RuntimeError(f"Experiments need a package that is missing ({error}): {cure}") from error
+    if list or figure is None:
+        print(experiments.listing())
+        return 0
+    return experiments.reproduce(figure, **arguments)
 
 
 def _doctor() -> int:

@@ -1,0 +1,28 @@
+"""
+The experiments of the report: runs as data, results as tidy CSV, figures from these.
+
+>>> from sb3_cpm.experiments import draw, run_experiment, summary_table
+>>> run_experiment("mountaincar", quick=True, jobs=2)  # doctest: +SKIP
+>>> draw("mountaincar", quick=True)  # doctest: +SKIP
+"""
+
+from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
+from sb3_cpm.experiments.reports import draw, listing, reproduce, run_experiment, summary_table
+from sb3_cpm.experiments.single_run import RunResult
+from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
+
+__all__ = [
+    "EXPERIMENTS",
+    "Contender",
+    "Experiment",
+    "Plan",
+    "RunResult",
+    "RunSpec",
+    "Task",
+    "draw",
+    "find_experiment",
+    "listing",
+    "reproduce",
+    "run_experiment",
+    "summary_table",
+]

@@ -1,0 +1,231 @@
+"""
+The experiments of the report, and the two that say most in little time, as data.
+
+Contenders name files of ``zoo_configs/``. Quick versions run on ``CPMToy-v0``, which has a camera, a point cloud and a state
+like the robot tasks but needs no renderer: they show that everything works and what the figures look like, not what is true.
+"""
+
+from typing import Any
+
+from sb3_cpm.experiments.specification import Contender, Experiment, Plan, Task
+from sb3_cpm.zoo.agents import nearest
+
+
+def challenger(**kwargs: Any) -> dict[str, Any]:
+    """Overrides of the arguments of ``ChallengerCallback``."""
+    return {"callback": {"sb3_cpm.ChallengerCallback": kwargs}}
+
+
+PICKCUBE = Task("PickCube-v1", "CPM/PickCube-v1")
+VISUAL = tuple(
+    Task(name, f"CPM/{name}")
+    for name in ("PickCube-v1", "PickSingleEGAD-v1", "PickSingleYCB-v1", "StackCube-v1", "TurnFaucet-v1")
+)
+TOY, MOUNTAINCAR, POINTMAZE = (Task(name, name) for name in ("CPMToy-v0", "MountainCarContinuous-v0", "PointMaze_UMaze-v3"))
+#: The player of the experiments with state vectors: half an update per step as in ManiSkill's example, smaller networks.
+STATE = {"policy_kwargs": {"net_arch": [128, 128]}, "batch_size": 128, "train_freq": 2, "gradient_steps": 1}
+SMALL = {"learning_starts": 200, "batch_size": 64, "buffer_size": 5000, "train_freq": 4, "gradient_steps": 1}
+
+
+def controller(mode: str) -> Task:
+    """PickCube with state vectors and one of the robot's controllers."""
+    return Task(f"PickCubeState-v1-{mode}", "CPM/PickCubeState-v1", {"env_kwargs": {"control_mode": mode}})
+
+
+SAC = Contender("SAC", "sac")
+HER = Contender("SAC+HER", "sac_her")
+CPM = Contender("CPM-SAC", "cpm_sac")
+HIGH = Contender("CPM high exploration", "cpm_sac_high_exploration")
+SIMPLE = Contender("CPM simple", "cpm_sac")
+REPORT = Contender("CPM report", "cpm_sac_report")
+DREAMER = Contender("Dreamer", "dreamer")
+PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
+PPO_RGBD = Contender("PPO RGBD", "ppo_rgbd")
+PPO_CLOUD = Contender("PPO point cloud", "ppo_pointcloud")
+FIVE = (HIGH, SIMPLE, DREAMER, PPO_CLOUD, PPO_RGBD)
+LOG = Contender("CPM log", "cpm_sac", challenger(uncertainty_kwargs={"metric": "log"}))
+DECAYS = tuple(
+    Contender(f"CPM {name}", "cpm_sac", challenger(decay=name))
+    for name in ("constant", "linear", "exponential", "inverse_time", "cosine", "logistic")
+)
+MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_joint_pos", "pd_joint_target_delta_pos")
+CONTROLLERS = tuple(controller(mode) for mode in MODES)
+
+_FULL = Plan((PICKCUBE,), 200_000, 20_000, 20, 5, cost="5 to 10 hours per run on a core, less with a GPU")
+_QUICK = Plan((TOY,), 1500, 500, 5, 2, SMALL, cost="2 to 6 minutes on 2 cores")
+_PPO_QUICK = Plan((TOY,), 3000, 1000, 5, 2, cost="2 minutes on 2 cores")
+
+_ALL = (
+    Experiment(
+        "pickcube-state",
+        "",
+        "PickCube-v1 from state vectors",
+        "not in the report: the same method where it is fast",
+        (SAC, CPM, HER),
+        "curves",
+        Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 17 CPU minutes per run"),
+        Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "mountaincar",
+        "",
+        "MountainCarContinuous-v0: a reward that has to be found",
+        "not in the report: hard exploration in minutes",
+        (SAC, CPM, PLAN2EXPLORE),
+        "curves",
+        Plan(
+            (MOUNTAINCAR,),
+            10_000,
+            2_000,
+            5,
+            10,
+            cost="30 to 90 CPU seconds per run",
+        ),
+        Plan((MOUNTAINCAR,), 4_000, 1_000, 3, 2, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "pointmaze",
+        "",
+        "PointMaze_UMaze-v3 with sparse rewards",
+        "not in the report: a sparse goal task where hindsight applies",
+        (SAC, CPM, HER),
+        "curves",
+        Plan((POINTMAZE,), 50_000, 5_000, 20, 5, cost="2 to 5 CPU minutes per run"),
+        Plan((POINTMAZE,), 4_000, 2_000, 3, 1, cost="1 minute on 2 cores"),
+    ),
+    Experiment(
+        "baselines",
+        "3",
+        "PPO on RGBD after ManiSkill's tutorial, five tasks",
+        "PPO succeeds seldom on PickCube and never on the other tasks",
+        (PPO_RGBD,),
+        "curves",
+        Plan(VISUAL, 200_000, 20_000, 20, 5, cost="1 to 2 hours per run on a core"),
+        _PPO_QUICK,
+    ),
+    Experiment(
+        "five-agents",
+        "4",
+        "Five agents on PickCube-v1, evaluation",
+        "both handicapped CPM agents succeed sometimes and early; PPO on point clouds has the best return and never succeeds",
+        FIVE,
+        "curves",
+        _FULL,
+        _QUICK,
+    ),
+    Experiment(
+        "five-agents-training",
+        "5",
+        "Five agents on PickCube-v1, training episodes",
+        "exploration is high, so that training succeeds seldom; PPO on point clouds does best there",
+        FIVE,
+        "training",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "challenge-quality",
+        "6",
+        "Rewards r, uncertainty u and the coefficient c of the score",
+        "c follows the fluctuating magnitudes and so keeps r and u in balance",
+        (HIGH, SIMPLE),
+        "quality",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "challenge-filters",
+        "7",
+        "Tolerances of the challenge filter",
+        "all three tolerances adjust to what was accepted and rejected",
+        (HIGH, SIMPLE),
+        "filters",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "artificial-rewards",
+        "8",
+        "Exploration and the coefficients of the artificial reward",
+        "peaks of the exploration reward are followed by the coefficients of the other terms",
+        (HIGH, SIMPLE),
+        "rewards",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "plan2explore",
+        "9",
+        "Ensemble loss and the scale k before the exponential function; exp against log",
+        "k adapts to the ensemble's spread, and stays low where the loss suddenly rises",
+        (SIMPLE, LOG, PLAN2EXPLORE),
+        "plan2explore",
+        _FULL,
+        _QUICK,
+    ),
+    Experiment(
+        "world-model",
+        "10",
+        "Losses of the world model, and its errors",
+        "image loss near 5.7, pixel error below 0.1; high exploration keeps the model from understanding rewards",
+        (HIGH, SIMPLE, DREAMER),
+        "world_model",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "player",
+        "11",
+        "The player's losses and Q values on D and on I",
+        "both are in the same range on both buffers",
+        (HIGH, SIMPLE),
+        "player",
+        _FULL,
+        _QUICK,
+        source="five-agents",
+    ),
+    Experiment(
+        "controllers",
+        "B.3",
+        "The robot's controllers, PickCube-v1 from state vectors",
+        "pd_ee_delta_pose was chosen",
+        (SAC,),
+        "curves",
+        Plan(CONTROLLERS, 100_000, 10_000, 20, 3, STATE, cost="12 CPU minutes per run"),
+        Plan(CONTROLLERS[:2], 2000, 1000, 5, 1, STATE, cost="1 minute on 2 cores"),
+    ),
+    Experiment(
+        "decays",
+        "B.4",
+        "Decay models of the exploration probability",
+        "the report's appendix B.4 is empty",
+        DECAYS,
+        "decays",
+        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 5, cost="90 CPU seconds per run"),
+        Plan((TOY,), 1500, 500, 5, 1, SMALL, cost="3 minutes on 2 cores"),
+    ),
+)
+
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _ALL}
+"""By name."""
+
+
+def find_experiment(name: str) -> Experiment:
+    """
+    :param name: of an experiment, or the number of a figure: ``"4"``, ``"figure4"``, ``"B.3"``
+    :raises ValueError: if there is none, with the nearest
+    """
+    wanted = str(name).strip().lower().removeprefix("figure").removeprefix("fig").strip(" .-_")
+    for experiment in EXPERIMENTS.values():
+        if str(name) == experiment.name or (experiment.figure and wanted == experiment.figure.lower()):
+            return experiment
+    figures = [experiment.figure for experiment in EXPERIMENTS.values() if experiment.figure]
+    raise ValueError(
+        f"There is no experiment or figure {name!r}.{nearest(str(name), [*EXPERIMENTS, *figures])} Names: "
+        f"{', '.join(EXPERIMENTS)}; figures: {', '.join(figures)}."
+    )

@@ -1,0 +1,67 @@
+"""
+Deterministic evaluation of any SB3 model: always the same episodes, which training never sees.
+
+Unlike SB3's ``evaluate_policy`` it seeds every episode, and tells success at the end from success at any moment: ManiSkill's
+``success`` is not sticky, an arm can reach its goal and leave it again.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+
+from sb3_cpm.run.evaluation import FIRST_SEED
+
+
+class Outcome(NamedTuple):
+    """
+    One episode.
+
+    :param episode_return: sum of the task's own rewards (of ``Monitor``, below all reward wrappers)
+    :param length: steps
+    :param success_once: whether it was a success in any step, None where the environment doesn't say
+    :param success_at_end: whether it was one in the last step
+    """
+
+    episode_return: float
+    length: int
+    success_once: bool | None
+    success_at_end: bool | None
+
+
+def success_of(info: dict[str, Any]) -> bool | None:
+    """:return: what an info says about success, None if nothing; gymnasium-robotics says ``success``, SB3 ``is_success``"""
+    told = info.get("is_success", info.get("success"))
+    return None if told is None else bool(told)
+
+
+def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> list[Outcome]:
+    """
+    Play episodes with seeds from ``FIRST_SEED`` on.
+
+    :param model: the player; recurrent ones get their state back
+    :param env: one environment, made like those of the training and not one of them
+    :param n_episodes: how many
+    """
+    if isinstance(env, VecNormalize) and model.get_vec_normalize_env() is not None:
+        assert model.env is not None
+        sync_envs_normalization(model.env, env)
+        env.training = env.norm_reward = False
+    return [_play(model, env, FIRST_SEED + index) for index in range(n_episodes)]
+
+
+def _play(model: BaseAlgorithm, env: VecEnv, seed: int) -> Outcome:
+    env.seed(seed)
+    observation = env.reset()
+    state, first, successes = None, np.ones(1, dtype=bool), []
+    while True:
+        action, state = model.predict(observation, state=state, episode_start=first, deterministic=True)  # type: ignore[arg-type]
+        observation, _, dones, infos = env.step(action)
+        first = dones
+        successes.append(success_of(infos[0]))
+        if dones[0]:
+            break
+    episode = infos[0]["episode"]
+    at_end = successes[-1]
+    return Outcome(float(episode["r"]), int(episode["l"]), None if at_end is None else any(successes), at_end)

@@ -1,0 +1,251 @@
+"""
+Figures of the experiments, from their CSV files alone.
+
+Lines are interquartile means over seeds, bands 95% stratified bootstrap intervals (see :mod:`sb3_cpm.experiments.statistics`).
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sb3_cpm.experiments.collect import Data, collect
+from sb3_cpm.experiments.specification import Experiment
+from sb3_cpm.experiments.statistics import binned, estimate, per_seed
+from sb3_cpm.run.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE
+
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
+#: Columns of evaluations.csv with the words for them.
+SCORES = {
+    "success_at_end": "success at the end of the episode",
+    "success_once": "success at any moment",
+    "return": "return",
+}
+
+
+class Panel(NamedTuple):
+    """
+    Logged numbers in one axis.
+
+    :param title: of the axis
+    :param names: what is drawn, by its name in diagnostics.csv; of alternatives in a tuple the first that was logged
+    :param log: logarithmic axis
+    """
+
+    title: str
+    names: tuple[str | tuple[str, ...], ...]
+    log: bool = False
+
+
+def _model(name: str) -> tuple[str, ...]:
+    """A loss of the world model: logged by the challenger, and by Dreamer as its own."""
+    return (f"challenger/{name}", f"train/{name}")
+
+
+PANELS: dict[str, tuple[Panel, ...]] = {
+    "quality": (
+        Panel("u, mean of a trajectory", ("challenge/uncertainty",), True),
+        Panel("r, mean of a challenge after relabelling", ("challenge/reward_extrinsic",)),
+        Panel("c, coefficient of r in the score S = c r + u", ("challenge/c",), True),
+    ),
+    "filters": (
+        Panel("w1, novel enough (larger is looser)", ("challenge/w1",)),
+        Panel("w2, relevant to the task (larger is looser)", ("challenge/w2",)),
+        Panel("w3, a highlight (smaller is looser)", ("challenge/w3",)),
+        Panel(
+            "share accepted so far: F1, F2 (dashed), F3 (dotted)",
+            ("challenge/acceptance_novel", "challenge/acceptance_relevant", "challenge/acceptance_highlight"),
+        ),
+    ),
+    "rewards": (
+        Panel("epsilon, probability that C acts", ("rollout/exploration_rate",)),
+        Panel("u, exploration reward before scaling", ("challenge/uncertainty",), True),
+        Panel("c_expl", ("challenge/c_expl",), True),
+        Panel("c_step", ("challenge/c_step",), True),
+        Panel("c_emb", ("challenge/c_emb",), True),
+        Panel("r', mean artificial reward", ("challenge/reward",)),
+    ),
+    "plan2explore": (
+        Panel("ensemble loss", (_model("uncertainty_loss"),)),
+        Panel("k, scale before the exponential function", (_model("exp_scale"),), True),
+        Panel("disagreement before scaling", (_model("raw_disagreement"),), True),
+        Panel("disagreement", (_model("disagreement"),)),
+    ),
+    "world_model": (
+        Panel("image loss", (_model("image_loss"),)),
+        Panel("pixel error, mean absolute, scale of [-0.5, 0.5]", (_model("pixel_error"),)),
+        Panel("KL of posterior and prior, nats", (_model("kl"),)),
+        Panel("reward loss", (_model("reward_loss"),)),
+        Panel("reward error, mean absolute", (_model("reward_error"),)),
+        Panel("reward error over mean absolute reward", (_model("relative_reward_error"),)),
+    ),
+    "player": (
+        Panel("Q values (dashed: on I)", ("player/q_D", "player/q_I")),
+        Panel("critic loss (dashed: on I)", ("player/critic_loss_D", "player/critic_loss_I"), True),
+        Panel("actor loss (dashed: on I)", ("player/actor_loss_D", "player/actor_loss_I")),
+    ),
+}
+
+
+def draw_experiment(experiment: Experiment, results: str | Path, quick: bool = False) -> tuple[Figure, list[str]]:
+    """
+    :param experiment: what is drawn
+    :param results: folder of all results
+    :param quick: the quick version
+    :return: the figure, and notes about its data
+    :raises ValueError: where there is no data, with the command that makes it
+    """
+    data = collect(experiment, results, quick)
+    with plt.rc_context(STYLE):
+        figure = DRAWINGS[experiment.drawing](experiment, data)
+        number = f"Figure {experiment.figure}: " if experiment.figure else ""
+        figure.suptitle(f"{number}{experiment.title}{' (quick version)' if quick else ''}", fontweight="bold")
+    return figure, data.notes
+
+
+def _agents(experiment: Experiment, table: pd.DataFrame) -> list[str]:
+    """In the catalog's order, those that there is data of."""
+    there = set(table["agent"])
+    return [contender.name for contender in experiment.contenders if contender.name in there]
+
+
+def _colours(experiment: Experiment) -> dict[str, str]:
+    """An agent has the same colour in all panels, whether or not the others have data."""
+    return {contender.name: COLOURS[index % len(COLOURS)] for index, contender in enumerate(experiment.contenders)}
+
+
+def _line(axes: Axes, scores: pd.DataFrame, colour: str, label: str | None, style: str = "-") -> None:
+    curve = estimate(scores)
+    if not len(curve.steps):
+        return
+    axes.plot(curve.steps, curve.iqm, style, color=colour, label=label and f"{label} ({_seeds(curve.n_seeds)})")
+    if curve.n_seeds > 1:
+        axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, lw=0)
+
+
+def _seeds(number: int) -> str:
+    return "1 seed" if number == 1 else f"{number} seeds"
+
+
+def _grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    return plt.subplots(rows, columns, figsize=(4.6 * columns, 3.2 * rows + 0.6), squeeze=False, layout="constrained")
+
+
+def _nothing(axes: Axes, text: str) -> None:
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color=GREY)
+
+
+# ---------------------------------------------------------------------- scores of episodes
+
+
+def _draw_scores(experiment: Experiment, table: pd.DataFrame) -> Figure:
+    tasks = list(dict.fromkeys(table["env"]))
+    figure, grid = _grid(len(tasks), len(SCORES))
+    colours = _colours(experiment)
+    for task, row in zip(tasks, grid, strict=True):
+        of_task = table[table["env"] == task]
+        for (score, words), axes in zip(SCORES.items(), row, strict=True):
+            for agent in _agents(experiment, of_task):
+                of_agent = of_task[of_task["agent"] == agent].dropna(subset=[score])
+                if len(of_agent):
+                    _line(axes, per_seed(of_agent, score), colours[agent], agent)
+            axes.set_title(f"{task}\n{words}" if len(tasks) > 1 else words)
+            if score != "return":
+                axes.set_ylim(-0.05, 1.05)
+            if not axes.lines:
+                _nothing(axes, "this task says nothing about success")
+    for axes in grid[-1]:
+        axes.set_xlabel("environment steps")
+    _shared_legend(figure, grid)
+    return figure
+
+
+def _shared_legend(figure: Figure, grid: np.ndarray) -> None:
+    """One legend below, with every label once."""
+    handles: dict[str, Artist] = {}
+    for axes in grid.flat:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if handles:
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 4), fontsize=9)
+
+
+def _draw_curves(experiment: Experiment, data: Data) -> Figure:
+    return _draw_scores(experiment, data.tables["evaluations"])
+
+
+def _draw_training(experiment: Experiment, data: Data) -> Figure:
+    return _draw_scores(experiment, binned(data.tables["training"]))
+
+
+# ---------------------------------------------------------------------- logged numbers
+
+
+def _draw_panels(panels: Sequence[Panel], experiment: Experiment, data: Data) -> Figure:
+    table = data.tables["diagnostics"]
+    columns = min(3, len(panels))
+    figure, grid = _grid(-(-len(panels) // columns), columns)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        _draw_panel(axes, panel, experiment, table)
+    for axes in list(grid.flat)[len(panels) :]:
+        axes.axis("off")
+    for axes in grid[-1]:
+        axes.set_xlabel("environment steps")
+    _shared_legend(figure, grid)
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel, experiment: Experiment, table: pd.DataFrame) -> None:
+    axes.set_title(panel.title, fontsize=9.5)
+    colours = _colours(experiment)
+    for agent in _agents(experiment, table):
+        of_agent = table[table["agent"] == agent]
+        for style, names in zip(("-", "--", ":"), panel.names, strict=False):
+            alternatives = (names,) if isinstance(names, str) else names
+            logged = [name for name in alternatives if (of_agent["name"] == name).any()]
+            if logged:
+                numbers = binned(of_agent[of_agent["name"] == logged[0]])
+                _line(axes, per_seed(numbers, "value"), colours[agent], agent if style == "-" else None, style)
+    if not axes.lines:
+        _nothing(axes, "nothing was logged")
+    elif panel.log and all((np.asarray(line.get_ydata(), dtype=float) > 0).all() for line in axes.lines):
+        axes.set_yscale("log")
+
+
+def _draw_decays(experiment: Experiment, data: Data) -> Figure:
+    """The schedules, and what became of them: return and success."""
+    evaluations, diagnostics = data.tables["evaluations"], data.tables["diagnostics"]
+    figure, grid = _grid(1, 3)
+    _draw_panel(grid[0, 0], PANELS["rewards"][0], experiment, diagnostics)
+    colours = _colours(experiment)
+    for axes, score in zip(grid[0, 1:], ("return", "success_once"), strict=True):
+        axes.set_title(SCORES[score], fontsize=9.5)
+        for agent in _agents(experiment, evaluations):
+            of_agent = evaluations[evaluations["agent"] == agent].dropna(subset=[score])
+            if len(of_agent):
+                _line(axes, per_seed(of_agent, score), colours[agent], agent)
+        if not axes.lines:
+            _nothing(axes, "this task says nothing about success")
+    for axes in grid[-1]:
+        axes.set_xlabel("environment steps")
+    _shared_legend(figure, grid)
+    return figure
+
+
+def _panels(name: str) -> Callable[[Experiment, Data], Figure]:
+    return lambda experiment, data: _draw_panels(PANELS[name], experiment, data)
+
+
+DRAWINGS: dict[str, Callable[[Experiment, Data], Figure]] = {
+    "curves": _draw_curves,
+    "training": _draw_training,
+    "decays": _draw_decays,
+    **{name: _panels(name) for name in PANELS},
+}
+"""How an experiment is drawn, by the name that the catalog has for it."""

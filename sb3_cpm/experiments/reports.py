@@ -1,0 +1,162 @@
+"""An experiment from start to figure, and its numbers as a table: what notebooks and the command line call."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
+from sb3_cpm.experiments.collect import collect
+from sb3_cpm.experiments.grid import perform_all
+from sb3_cpm.experiments.single_run import RunResult
+from sb3_cpm.experiments.specification import Experiment
+from sb3_cpm.experiments.statistics import estimate, per_seed
+from sb3_cpm.run.plots import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESULTS = "results"
+SUMMARY_SCORES = ("success_at_end", "success_once", "return")
+
+
+def run_experiment(
+    name: str,
+    quick: bool = True,
+    results: str | Path = RESULTS,
+    seeds: int | None = None,
+    jobs: int = 1,
+    tell: Callable[[str], None] = print,
+    steps: int | None = None,
+    device: str = "cpu",
+) -> list[RunResult]:
+    """
+    Make the runs of an experiment that are not there yet.
+
+    :param name: of an experiment, or a figure's number
+    :param quick: the version that takes minutes; its results are kept apart from the full ones
+    :param results: folder of all results
+    :param seeds: how many, from 0; None: as planned
+    :param jobs: processes at a time; 0: in this process
+    :param tell: is given lines about the progress
+    :param steps: of each run, to try something; None: as planned
+    :param device: PyTorch device of the runs
+    :return: what became of each run; a crashed one does not stop the others
+    :raises ValueError: for an unknown name, with the nearest
+    """
+    experiment = find_experiment(name)
+    if seeds is not None and seeds < 1:
+        raise ValueError(f"seeds={seeds}: expected 1 or more")
+    specs = list(experiment.runs(quick, seeds, steps))
+    return perform_all(specs, Path(results), jobs, tell, device)
+
+
+def draw(name: str, results: str | Path = RESULTS, quick: bool = False) -> "Figure":
+    """
+    :param name: of an experiment, or a figure's number
+    :param results: folder of all results
+    :param quick: draw the quick version
+    :return: the figure, from the CSV files alone
+    :raises ValueError: where there is no data, with the command that makes it
+    """
+    from sb3_cpm.experiments.figures import draw_experiment
+
+    figure, notes = draw_experiment(find_experiment(name), results, quick)
+    if notes:
+        figure.supxlabel("Note: " + "; ".join(notes), fontsize=7, wrap=True)
+    return figure
+
+
+def summary_table(name: str, results: str | Path = RESULTS, quick: bool = False) -> pd.DataFrame:
+    """
+    The last evaluation that all seeds have, in numbers.
+
+    :param name: of an experiment, or a figure's number
+    :param results: folder of all results
+    :param quick: the quick version
+    :return: a row per task and agent: seeds, step, and per score the interquartile mean with its 95% interval as text;
+        ``to_markdown()`` makes text of it
+    :raises ValueError: where there is no data, with the command that makes it
+    """
+    experiment = find_experiment(name)
+    table = collect(experiment, results, quick).tables["evaluations"]
+    rows = []
+    for task in dict.fromkeys(table["env"]):
+        for contender in experiment.contenders:
+            part = table[(table["env"] == task) & (table["agent"] == contender.name)]
+            if len(part):
+                rows.append({"task": task, "agent": contender.name, **_last(part)})
+    return pd.DataFrame(rows)
+
+
+def _last(part: pd.DataFrame) -> dict[str, object]:
+    row: dict[str, object] = {"seeds": part["seed"].nunique()}
+    for score in SUMMARY_SCORES:
+        scores = per_seed(part.dropna(subset=[score]), score) if part[score].notna().any() else pd.DataFrame()
+        if len(scores):
+            last = estimate(scores.iloc[[-1]])
+            row.setdefault("step", int(last.steps[0]))
+            row[score] = f"{last.iqm[0]:.2f} [{last.low[0]:.2f}, {last.high[0]:.2f}]"
+        else:
+            row[score] = "-"
+    return row
+
+
+def figure_path(experiment: Experiment, results: str | Path, quick: bool) -> Path:
+    """:return: where :func:`reproduce` saves the figure"""
+    number = f"figure_{experiment.figure}_" if experiment.figure else ""
+    return Path(results) / "figures" / f"{number}{experiment.name}{'-quick' if quick else ''}.png"
+
+
+def reproduce(
+    name: str,
+    quick: bool = False,
+    seeds: int | None = None,
+    jobs: int = 1,
+    results: str | Path = RESULTS,
+    draw_only: bool = False,
+    tell: Callable[[str], None] = print,
+    steps: int | None = None,
+    device: str = "cpu",
+) -> int:
+    """
+    Run what is missing, draw the figure, print the table: what ``python -m sb3_cpm reproduce`` does.
+
+    :return: exit status: 1 if a run crashed or was refused
+    :raises ValueError: as :func:`run_experiment` and :func:`draw`
+    """
+    experiment = find_experiment(name)
+    failed: list[RunResult] = []
+    if not draw_only:
+        plan = experiment.plan(quick)
+        n_runs = len(list(experiment.runs(quick, seeds)))
+        tell(f"{experiment.name}: {n_runs} runs of {steps or plan.steps} steps ({plan.cost}); what is there is skipped")
+        outcomes = run_experiment(name, quick, results, seeds, jobs, tell, steps, device)
+        failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused")]
+        for outcome in failed:
+            tell(f"{outcome.outcome}: {outcome.spec.name}: {outcome.message}")
+        if len(failed) == len(outcomes):
+            raise RuntimeError(f"None of the {len(outcomes)} runs of {experiment.name} could be made; see above.")
+    path = figure_path(experiment, results, quick)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = draw(name, results, quick)
+    save_figure(figure, path)
+    tell(summary_table(name, results, quick).to_string(index=False))
+    for note in collect(experiment, results, quick).notes:
+        tell(f"note: {note}")
+    tell(f"Drawn: {path}")
+    return 1 if failed else 0
+
+
+def listing() -> str:
+    """:return: all experiments with their figures and costs, as text"""
+    lines = []
+    for experiment in EXPERIMENTS.values():
+        number = f"figure {experiment.figure}" if experiment.figure else "no figure of the report"
+        source = f" (draws the runs of {experiment.source})" if experiment.source else ""
+        lines.append(f"{experiment.name}: {experiment.title} [{number}]{source}")
+        for kind, plan in (("full ", experiment.full), ("quick", experiment.quick)):
+            runs = plan.seeds * len(plan.tasks) * len(experiment.contenders)
+            lines.append(f"    {kind} {runs:>3} runs of {plan.steps} steps; {plan.cost}")
+    return "\n".join(lines)

@@ -1,0 +1,144 @@
+"""
+The folder of one run: who may write there, and what its state is.
+
+::
+
+    config.yml        everything that the run was made with; fingerprint, versions
+    evaluations.csv   one row per evaluation episode
+    training.csv      one row per training episode
+    diagnostics.csv   what was logged: step, name, value
+    finished.yml      only when the run came to its end
+    crashed.txt       the traceback of the last try, if that ended badly
+    checkpoint/       while the run goes on
+"""
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_cpm import __version__
+from sb3_cpm.experiments.specification import RunSpec, fingerprint
+from sb3_cpm.run.folder import versions, write_text, write_yaml
+from sb3_cpm.zoo.agents import Agent
+
+CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
+
+
+class OtherResultError(ValueError):
+    """A folder holds something else than what is asked for."""
+
+
+def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
+    """:return: what ``config.yml`` holds: the protocol, its fingerprint, and the versions"""
+    protocol = {
+        "algo": agent.algo,
+        "env_id": agent.env_id,
+        "hyperparameters": agent.hyperparameters,
+        "steps": spec.steps,
+        "eval_every": spec.eval_every,
+        "eval_episodes": spec.eval_episodes,
+    }
+    return {
+        "run": spec.as_dict(),
+        "protocol": protocol,
+        "fingerprint": fingerprint(protocol),
+        "sb3_cpm": __version__,
+        "versions": versions(),
+    }
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """
+    Let nobody else write this folder; the lock goes with the process, however that ends.
+
+    :raises RuntimeError: while another process holds it
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / ".lock"
+    with path.open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.seek(0)
+            raise RuntimeError(
+                f"{folder} is being written by another process ({file.read().strip() or 'unknown'}). Wait for it, or choose "
+                "another folder with --results."
+            ) from error
+        file.truncate(0)
+        file.write(f"pid {os.getpid()} since {time.strftime('%F %T')}")
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """:raises ValueError: if it is no YAML mapping"""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is damaged: it holds no mapping. Remove its folder to run it again.")
+    return content
+
+
+def is_finished(folder: Path) -> bool:
+    return (folder / FINISHED).exists()
+
+
+def check_belongs(folder: Path, wanted: dict[str, Any]) -> str | None:
+    """
+    Does the folder hold results of what is asked for?
+
+    :param folder: of the run
+    :param wanted: its :func:`description`
+    :return: None, or what is worth mentioning: the version that made it, if that is another one
+    :raises OtherResultError: if other hyperparameters made it
+    """
+    if not (folder / CONFIG).exists():
+        return None
+    theirs = read_yaml(folder / CONFIG)
+    if theirs.get("fingerprint") != wanted["fingerprint"]:
+        changes = differences(theirs.get("protocol") or {}, wanted["protocol"])
+        raise OtherResultError(
+            f"{folder} holds a run with other settings ({'; '.join(changes[:4])}). Nothing is overwritten: choose "
+            "another folder with --results, or remove that one yourself."
+        )
+    if theirs.get("sb3_cpm") != wanted["sb3_cpm"]:
+        return f"made by sb3_cpm {theirs.get('sb3_cpm')}, this is {wanted['sb3_cpm']}"
+    return None
+
+
+def differences(theirs: dict[str, Any], ours: dict[str, Any], prefix: str = "") -> list[str]:
+    """:return: ``"name: there 1, here 2"`` for every entry that differs, dicts entry by entry"""
+    found: list[str] = []
+    for key in sorted({*theirs, *ours}):
+        there, here = theirs.get(key), ours.get(key)
+        if isinstance(there, dict) and isinstance(here, dict):
+            found += differences(there, here, f"{prefix}{key}.")
+        elif there != here:
+            found.append(f"{prefix}{key}: there {there!r}, here {here!r}")
+    return found
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    write_yaml(folder / CONFIG, config)
+
+
+def write_finished(folder: Path, facts: dict[str, Any]) -> None:
+    write_yaml(folder / FINISHED, facts)
+    (folder / CRASHED).unlink(missing_ok=True)
+
+
+def write_crashed(folder: Path, text: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / CRASHED, text)

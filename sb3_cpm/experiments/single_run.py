@@ -1,0 +1,203 @@
+"""One run of an experiment: train, evaluate, leave tidy CSV; go on where a killed run ended."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cpm import __version__
+from sb3_cpm.experiments import checkpoint as checkpoints
+from sb3_cpm.experiments import run_folder
+from sb3_cpm.experiments.evaluation import evaluate, success_of
+from sb3_cpm.experiments.player_losses import log_player_losses
+from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.tables import DIAGNOSTICS, EVALUATIONS, TRAINING, DiagnosticsWriter, Table
+from sb3_cpm.zoo.agents import Built, load_agent
+
+#: How often diagnostics are written in a run.
+N_DUMPS = 50
+COLUMNS = {"evaluations": EVALUATIONS, "training": TRAINING, "diagnostics": DIAGNOSTICS}
+
+
+class RunResult(NamedTuple):
+    """
+    What became of a run.
+
+    :param spec: the run
+    :param outcome: ``"finished"``, ``"skipped"`` (its result was there), ``"refused"`` or ``"crashed"``
+    :param message: what else there is to say
+    :param folder: where its results are
+    """
+
+    spec: RunSpec
+    outcome: str
+    message: str
+    folder: Path
+
+
+def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda news: None, device: str = "cpu") -> RunResult:
+    """
+    Make a run, unless its result is there.
+
+    :param spec: the run
+    :param results: folder of all results
+    :param tell: is given a line now and then
+    :param device: PyTorch device; small networks are fastest on the CPU
+    :raises RuntimeError: while another process makes the same run
+    :raises ValueError: for an unknown agent or environment, for wrong hyperparameters, and if the folder holds a run with
+        other ones
+    """
+    folder = spec.folder(results)
+    agent = load_agent(spec.config, spec.env_id, spec.overrides)
+    config = run_folder.description(spec, agent)
+    note = run_folder.check_belongs(folder, config)
+    if run_folder.is_finished(folder):
+        return RunResult(spec, "skipped", note or "its result is there", folder)
+    th.set_num_threads(1)
+    with run_folder.locked(folder):
+        started = time.perf_counter()
+        found = checkpoints.find_checkpoint(folder)
+        if found is not None and note is not None:
+            raise run_folder.OtherResultError(f"{folder} holds an unfinished run {note}: finish it there, or remove it.")
+        built = agent.build(spec.seed, device=device, load_path=None if found is None else found / "model.zip")
+        try:
+            run_folder.write_config(folder, config)
+            watcher = Watcher(spec, folder, built, found, tell)
+            watcher.learn()
+            seconds = watcher.seconds_before + time.perf_counter() - started
+        finally:
+            built.env.close()
+        facts = {"steps": built.model.num_timesteps, "seconds": round(seconds, 1), "sb3_cpm": __version__}
+        run_folder.write_finished(folder, facts)
+        checkpoints.remove_checkpoints(folder)
+    return RunResult(spec, "finished", f"{seconds:.0f} s", folder)
+
+
+class Watcher(BaseCallback):
+    """
+    Evaluates, writes tables and makes checkpoints while a model learns.
+
+    Everything happens before a rollout: there the last one has been stored and trained on.
+
+    :param spec: the run
+    :param folder: of the run
+    :param built: model, callbacks, environments
+    :param found: the checkpoint that the model was loaded from
+    :param tell: is given a line after each evaluation
+    """
+
+    def __init__(
+        self, spec: RunSpec, folder: Path, built: Built, found: Path | None, tell: Callable[[str], None] = lambda news: None
+    ) -> None:
+        super().__init__()
+        self.spec, self.folder, self.built, self.found, self.tell = spec, folder, built, found, tell
+        self.eval_env: VecEnv = built.make_eval_env()
+        state: dict[str, Any] = {} if found is None else checkpoints.load_extra(found)
+        sizes = state.get("sizes", {})
+        self.tables = {name: Table(folder / f"{name}.csv", columns, sizes.get(name, 0)) for name, columns in COLUMNS.items()}
+        #: Wall-clock seconds of earlier processes.
+        self.seconds_before: float = state.get("seconds", 0.0)
+        self._started = time.perf_counter()
+        self._next_evaluation: int = state.get("next_evaluation", 0)
+        self._next_dump: int = state.get("next_dump", 0)
+        self._goes_on = found is not None
+        self._succeeded: list[bool | None] = []
+
+    def learn(self) -> None:
+        """Train from where the model is to the end of the run."""
+        model, spec = self.built.model, self.spec
+        model.set_logger(Logger(None, [DiagnosticsWriter(self.tables["diagnostics"])]))
+        callbacks = [*self.built.callbacks, self]
+        if self.found is not None:
+            checkpoints.restore_buffer(self.found, model)
+            callbacks.insert(-1, checkpoints.ChallengerRestorer(self.found, self.built.callbacks))
+        try:
+            model.learn(
+                spec.steps - model.num_timesteps,
+                callback=callbacks,
+                log_interval=None,  # type: ignore[arg-type]
+                reset_num_timesteps=False,
+            )
+            self._dump()
+            self._evaluate()
+        finally:
+            self.eval_env.close()
+            for table in self.tables.values():
+                table.close()
+
+    # ------------------------------------------------------------------ SB3's hooks
+
+    def _on_training_start(self) -> None:
+        self._succeeded = [None] * self.training_env.num_envs
+
+    def _on_rollout_start(self) -> None:
+        if self._goes_on:  # what comes now came after this checkpoint in the first try, too
+            self._goes_on = False
+            self._start_afresh()
+        evaluation_due = self._next_evaluation <= self.num_timesteps < self.spec.steps
+        # before a checkpoint, too: what the logger has gathered is not part of it
+        if self.num_timesteps >= self._next_dump or evaluation_due:
+            self._dump()
+        if evaluation_due:
+            self._evaluate()
+            self._next_evaluation += self.spec.eval_every
+            self._save()
+            self._start_afresh()
+
+    def _on_step(self) -> bool:
+        for env_idx, info in enumerate(self.locals["infos"]):
+            success = success_of(info)
+            if success is not None:
+                self._succeeded[env_idx] = bool(self._succeeded[env_idx]) or success
+            if "episode" in info:
+                once = self._succeeded[env_idx]
+                self._succeeded[env_idx] = None
+                episode = info["episode"]
+                self.tables["training"].add(
+                    (self.num_timesteps, env_idx, float(episode["r"]), int(episode["l"]), once, success)
+                )
+        return True
+
+    # ------------------------------------------------------------------ what it does
+
+    def _dump(self) -> None:
+        every = max(self.spec.steps // N_DUMPS, 1)
+        self._next_dump = (self.num_timesteps // every + 1) * every
+        log_player_losses(self.model)
+        if self.num_timesteps:
+            self.model.dump_logs()
+
+    def _start_afresh(self) -> None:
+        checkpoints.fresh_start(self.model, self.spec.seed)
+        self._succeeded = [None] * len(self._succeeded)
+
+    def _evaluate(self) -> None:
+        spec = self.spec
+        outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes)
+        step = self.built.model.num_timesteps
+        for index, outcome in enumerate(outcomes):
+            self.tables["evaluations"].add((spec.experiment, spec.agent, spec.env, spec.seed, step, index, *outcome))
+        self.tell(self._news(step, outcomes))
+
+    def _news(self, step: int, outcomes: list[Any]) -> str:
+        told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
+        success = f", success at end {np.mean(told):.0%}" if told else ""
+        seconds = self.seconds_before + time.perf_counter() - self._started
+        left = f", about {seconds * (self.spec.steps - step) / step / 60:.1f} min left" if step else ""
+        mean = float(np.mean([outcome.episode_return for outcome in outcomes]))
+        return f"{self.spec.name}: step {step}/{self.spec.steps}, return {mean:.2f}{success}{left}"
+
+    def _save(self) -> None:
+        state = {
+            "sizes": {name: table.size for name, table in self.tables.items()},
+            "seconds": self.seconds_before + time.perf_counter() - self._started,
+            "next_evaluation": self._next_evaluation,
+            "next_dump": self._next_dump,
+        }
+        checkpoints.save_checkpoint(self.folder, self.model, self.built.callbacks, state)

@@ -1,0 +1,187 @@
+"""What a run and an experiment are: plain data."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """
+    Everything that determines one run, except the versions of the packages.
+
+    :param experiment: name of the folder that its results go to
+    :param agent: name of the contender, a folder below that
+    :param env: name of the task, a folder below that
+    :param seed: rules the whole run
+    :param config: the agent's file, a name in ``zoo_configs/`` or a path
+    :param env_id: a gymnasium id
+    :param overrides: hyperparameters that differ from the file's
+    :param steps: environment steps to train for
+    :param eval_every: environment steps between two evaluations
+    :param eval_episodes: episodes of each
+    """
+
+    experiment: str
+    agent: str
+    env: str
+    seed: int
+    config: str
+    env_id: str
+    overrides: dict[str, Any]
+    steps: int
+    eval_every: int
+    eval_episodes: int
+
+    @property
+    def name(self) -> str:
+        """For people: which run this is."""
+        return f"{self.experiment}/{self.agent}/{self.env}/seed{self.seed}"
+
+    def folder(self, results: Path) -> Path:
+        """:return: where the results of this run are"""
+        return results / self.experiment / self.agent / self.env / f"seed{self.seed}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """:return: plain data"""
+        return asdict(self)
+
+
+def fingerprint(protocol: dict[str, Any]) -> str:
+    """
+    :param protocol: plain data that says what a result was made with
+    :return: twelve characters that differ whenever it does
+    """
+    return hashlib.sha256(json.dumps(protocol, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """
+    An agent under the name that the figure's legend has.
+
+    :param name: e.g. ``"CPM-SAC"``; also the name of a folder
+    :param config: its file in ``zoo_configs/``
+    :param overrides: hyperparameters that differ from the file's
+    """
+
+    name: str
+    config: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    An environment under the name that the figure's panels have.
+
+    :param name: also the name of a folder
+    :param env_id: a gymnasium id
+    :param overrides: hyperparameters that all agents get here, most often ``env_kwargs``
+    """
+
+    name: str
+    env_id: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    How much is run.
+
+    :param tasks: every contender runs on each
+    :param steps: environment steps of each run
+    :param eval_every: steps between evaluations
+    :param eval_episodes: episodes of each
+    :param seeds: how many, from 0
+    :param overrides: hyperparameters that all runs get
+    :param cost: what it takes, in words, measured
+    """
+
+    tasks: tuple[Task, ...]
+    steps: int
+    eval_every: int
+    eval_episodes: int = 20
+    seeds: int = 3
+    overrides: dict[str, Any] = field(default_factory=dict)
+    cost: str = ""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    A question with the runs that answer it and the figure that shows it.
+
+    :param name: e.g. ``"mountaincar"``
+    :param figure: of the report, e.g. ``"4"`` or ``"B.3"``; "" where it has none
+    :param title: of the figure
+    :param claim: what the report says, in short
+    :param contenders: the agents
+    :param drawing: a name in :data:`sb3_cpm.experiments.figures.DRAWINGS`
+    :param full: the whole experiment
+    :param quick: a version that takes minutes on two cores
+    :param source: name of the experiment whose runs it draws, where it needs none of its own
+    """
+
+    name: str
+    figure: str
+    title: str
+    claim: str
+    contenders: tuple[Contender, ...]
+    drawing: str
+    full: Plan
+    quick: Plan
+    source: str | None = None
+
+    def plan(self, quick: bool) -> Plan:
+        return self.quick if quick else self.full
+
+    def folder_name(self, quick: bool) -> str:
+        """:return: where the results are; quick and full ones are never mixed"""
+        return (self.source or self.name) + ("-quick" if quick else "")
+
+    def runs(
+        self,
+        quick: bool = False,
+        seeds: int | None = None,
+        steps: int | None = None,
+        agents: Sequence[str] | None = None,
+    ) -> Iterator[RunSpec]:
+        """
+        :param quick: the version that takes minutes
+        :param seeds: how many, from 0; None: the plan's number
+        :param steps: of each run; None: the plan's number
+        :param agents: names of contenders; None: all
+        :return: all runs, first seeds first
+        """
+        plan = self.plan(quick)
+        for seed in range(plan.seeds if seeds is None else seeds):
+            for task in plan.tasks:
+                for contender in self.contenders:
+                    if agents is not None and contender.name not in agents:
+                        continue
+                    yield RunSpec(
+                        experiment=self.folder_name(quick),
+                        agent=contender.name,
+                        env=task.name,
+                        seed=seed,
+                        config=contender.config,
+                        env_id=task.env_id,
+                        overrides=_merged(plan.overrides, task.overrides, contender.overrides),
+                        steps=steps or plan.steps,
+                        eval_every=plan.eval_every,
+                        eval_episodes=plan.eval_episodes,
+                    )
+
+
+def _merged(*overrides: dict[str, Any]) -> dict[str, Any]:
+    from sb3_cpm.zoo.agents import merge
+
+    result: dict[str, Any] = {}
+    for one in overrides:
+        result = merge(result, one)
+    return result
