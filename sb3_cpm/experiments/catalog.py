@@ -23,8 +23,14 @@ VISUAL = tuple(
 )
 TOY, MOUNTAINCAR, POINTMAZE = (Task(name, name) for name in ("CPMToy-v0", "MountainCarContinuous-v0", "PointMaze_UMaze-v3"))
 #: The player of the experiments with state vectors: half an update per step as in ManiSkill's example, smaller networks.
-STATE = {"policy_kwargs": {"net_arch": [128, 128]}, "batch_size": 128, "train_freq": 2, "gradient_steps": 1}
-SMALL = {"learning_starts": 200, "batch_size": 64, "buffer_size": 5000, "train_freq": 4, "gradient_steps": 1}
+STATE = {"sac": {"policy_kwargs": {"net_arch": [128, 128]}, "batch_size": 128, "train_freq": 2, "gradient_steps": 1}}
+#: Everything smaller, for the quick versions.
+SMALL: dict[str, dict[str, Any]] = {
+    "sac": {"learning_starts": 200, "batch_size": 64, "buffer_size": 5000, "train_freq": 4, "gradient_steps": 1},
+    "ppo": {"n_envs": 2, "n_steps": 250, "batch_size": 50, "n_epochs": 3},
+    "dreamer": {"learning_starts": 200, "buffer_size": 5000, "train_freq": 25},
+    "plan2explore": {"learning_starts": 200, "buffer_size": 5000, "train_freq": 25},
+}
 
 
 def controller(mode: str) -> Task:
@@ -53,7 +59,7 @@ CONTROLLERS = tuple(controller(mode) for mode in MODES)
 
 _FULL = Plan((PICKCUBE,), 200_000, 20_000, 20, 5, cost="5 to 10 hours per run on a core, less with a GPU")
 _QUICK = Plan((TOY,), 1500, 500, 5, 2, SMALL, cost="2 to 6 minutes on 2 cores")
-_PPO_QUICK = Plan((TOY,), 3000, 1000, 5, 2, cost="2 minutes on 2 cores")
+_PPO_QUICK = Plan((TOY,), 3000, 1000, 5, 2, SMALL, cost="2 minutes on 2 cores")
 
 _ALL = (
     Experiment(

@@ -98,7 +98,7 @@ class Plan:
     :param eval_every: steps between evaluations
     :param eval_episodes: episodes of each
     :param seeds: how many, from 0
-    :param overrides: hyperparameters that all runs get
+    :param overrides: by algorithm (``"sac"``, ``"ppo"``, ...), hyperparameters that its runs get
     :param cost: what it takes, in words, measured
     """
 
@@ -107,7 +107,7 @@ class Plan:
     eval_every: int
     eval_episodes: int = 20
     seeds: int = 3
-    overrides: dict[str, Any] = field(default_factory=dict)
+    overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: str = ""
 
 
@@ -158,6 +158,8 @@ class Experiment:
         :param agents: names of contenders; None: all
         :return: all runs, first seeds first
         """
+        from sb3_cpm.zoo.agents import algorithm_of
+
         plan = self.plan(quick)
         for seed in range(plan.seeds if seeds is None else seeds):
             for task in plan.tasks:
@@ -171,7 +173,9 @@ class Experiment:
                         seed=seed,
                         config=contender.config,
                         env_id=task.env_id,
-                        overrides=_merged(plan.overrides, task.overrides, contender.overrides),
+                        overrides=_merged(
+                            plan.overrides.get(algorithm_of(contender.config), {}), task.overrides, contender.overrides
+                        ),
                         steps=steps or plan.steps,
                         eval_every=plan.eval_every,
                         eval_episodes=plan.eval_episodes,
