@@ -11,12 +11,16 @@ import pytest
 import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.dreamer import Dreamer
 from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run import environment as environments
+from sb3_cpm.run.environment import make_env
+from sb3_cpm.run.evaluation import play_episode
 from sb3_cpm.run.folder import atomic, make_run_folder
 from sb3_cpm.run.plots import read_csv, running_mean
 from sb3_cpm.run.recorder import CSVTable
@@ -261,6 +265,34 @@ def test_pick_cube(tmp_path: Path) -> None:
     image = imageio.imread(tmp_path / "run" / "challenge_gallery.png")[..., :3]
     assert image.std() > 20
     assert len(read_video(tmp_path / "run" / "evaluation.mp4")) == 51
+
+
+def test_a_recurrent_player_keeps_its_memory_within_an_episode() -> None:
+    """``predict`` of Dreamer without its state would judge every observation as the first of an episode."""
+    env = make_env("CPMToy-v0", keys=("state",))
+    model = Dreamer("MultiInputPolicy", env, preset={"deter_size": 16, "hidden_size": 16}, learning_starts=50, seed=0)
+    model.learn(60)
+    with_memory = play_episode(model, env, seed=7)
+    expected, _ = evaluate_policy(model, SeededReset(env, 7), n_eval_episodes=1, warn=False)
+    assert with_memory.episode_return == pytest.approx(expected, rel=1e-5)
+    memoryless = [model.predict(env.reset(seed=7)[0], deterministic=True)[0]]
+    total, done = 0.0, False
+    while not done:
+        observation, reward, terminated, truncated, _ = env.step(memoryless[-1])
+        memoryless.append(model.predict(observation, deterministic=True)[0])
+        total, done = total + float(reward), terminated or truncated
+    assert total != pytest.approx(with_memory.episode_return, rel=1e-5)
+
+
+class SeededReset(gym.Wrapper):
+    """Resets with the same seed always: ``evaluate_policy`` gives none."""
+
+    def __init__(self, env: gym.Env, seed: int) -> None:
+        super().__init__(env)
+        self.seed = seed
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=self.seed, options=options)
 
 
 def test_atomic_files(tmp_path: Path) -> None:

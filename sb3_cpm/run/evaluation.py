@@ -41,9 +41,11 @@ def play_episode(model: BaseAlgorithm, env: gym.Env, seed: int, frames: list[np.
     """
     observation, info = env.reset(seed=seed)
     total, length, done = 0.0, 0, False
+    memory, start = None, np.ones(1, dtype=bool)  # of recurrent players such as Dreamer; others ignore both
     while not done:
         _film(env, frames)
-        action, _ = model.predict(observation, deterministic=True)
+        action, memory = model.predict(observation, memory, start, deterministic=True)
+        start = np.zeros(1, dtype=bool)
         observation, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         length += 1
