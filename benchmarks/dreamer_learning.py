@@ -1,0 +1,125 @@
+"""
+How fast Dreamer learns: Pendulum-v1 from its state vector, and the toy robot's reaching from camera pictures alone.
+
+::
+
+    python benchmarks/dreamer_learning.py run --agent dreamer --env pendulum toy_camera --seed 0 1 2
+    python benchmarks/dreamer_learning.py run --agent sheeprl --env pendulum --seed 0 1 2 --peer-python PATH
+    python benchmarks/dreamer_learning.py plot
+
+Every run writes ``results/dreamer/AGENT/ENV/seedN.csv`` when it is complete; complete runs are skipped. Each evaluation plays
+the same ten episodes (seeds from 1,000,000 on) deterministically. ``plot`` draws ``results/dreamer/learning.png`` and writes
+``results/dreamer/summary.csv``, means over seeds with 95% confidence intervals. sheeprl is run by
+``peers/sheeprl_learning.py`` in an interpreter of its own, with the same sizes, environment steps and updates.
+"""
+
+import argparse
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from learning_curves import FixedEpisodes, Table, curves, draw, interval, read
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
+
+import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm.dreamer import Dreamer
+from sb3_cpm.presets import make_preset
+
+FOLDER = Path(__file__).parents[1] / "results" / "dreamer"
+EPISODES = 10
+NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
+TASKS: dict[str, dict[str, Any]] = {
+    "pendulum": dict(id="Pendulum-v1", steps=10_000, every=1000, solved=-200, model={}),
+    "toy_camera": dict(
+        id="CPMToy-v0",
+        env_kwargs=dict(keys=("camera",)),
+        steps=6000,
+        every=500,
+        solved=40,
+        model=dict(learning_starts=500, preset=dict(kl_scale=0.1)),
+    ),
+}
+
+
+def make_env(env: str, n_envs: int = 1, seed: int = 0) -> VecEnv:
+    return make_vec_env(TASKS[env]["id"], n_envs, seed=seed, env_kwargs=TASKS[env].get("env_kwargs"))
+
+
+def run_dreamer(env: str, seed: int, path: Path) -> None:
+    task, table, start = TASKS[env], Table(path), time.process_time()
+    policy = "MultiInputPolicy" if isinstance(gym.make(task["id"]).observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = Dreamer(policy, make_env(env, seed=seed), seed=seed, device="cpu", **task["model"])
+
+    def record(step: int, returns: list[float], lengths: list[int]) -> None:
+        cpu = round(time.process_time() - start, 1)
+        for episode, (value, length) in enumerate(zip(returns, lengths, strict=True)):
+            table.add(agent="dreamer", env=env, seed=seed, step=step, episode=episode, **{"return": round(value, 4)},
+                      length=length, updates=model._n_updates, cpu_seconds=cpu)  # fmt: skip
+        print(f"dreamer {env} seed {seed} step {step}: {sum(returns) / len(returns):.1f} after {cpu} CPU s", flush=True)
+
+    model.learn(task["steps"], callback=FixedEpisodes(make_env(env, EPISODES), task["every"], record), log_interval=None)
+    table.complete()
+
+
+def run_sheeprl(env: str, seed: int, path: Path, python: str) -> None:
+    """In a process of its own, which writes the same table."""
+    task = TASKS[env]
+    settings = dict(
+        env=env, id=task["id"], seed=seed, steps=task["steps"], every=task["every"], episodes=EPISODES, path=str(path),
+        learning_starts=task["model"].get("learning_starts", 1000), train_freq=5,
+        preset=make_preset(task["model"].get("preset", {})),
+    )  # fmt: skip
+    script = Path(__file__).parent / "peers" / "sheeprl_learning.py"
+    subprocess.run([python, str(script), json.dumps(settings)], check=True)
+
+
+def plot() -> None:
+    data = curves(read(FOLDER), "return")
+    draw(
+        FOLDER / "learning.png", data, [env for env in TASKS if any(key[0] == env for key in data)],
+        "return of 10 fixed episodes", NAMES, {env: task["solved"] for env, task in TASKS.items()},
+    )  # fmt: skip
+    with (FOLDER / "summary.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["env", "agent", "step", "seeds", "mean_return", "ci95", "worst_seed"])
+        for (env, agent), steps in sorted(data.items()):
+            for step, values in steps.items():
+                numbers = (values.mean(), interval(values), values.min())
+                writer.writerow([env, agent, step, len(values), *(round(float(number), 2) for number in numbers)])
+                if step == max(steps):
+                    print(f"{env} {agent} step {step}: {numbers[0]:.1f} +- {numbers[1]:.1f}, worst seed {numbers[2]:.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", choices=["run", "plot"])
+    parser.add_argument("--agent", nargs="+", choices=list(NAMES), default=["dreamer"])
+    parser.add_argument("--env", nargs="+", choices=list(TASKS), default=list(TASKS))
+    parser.add_argument("--seed", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--peer-python", default=sys.executable, help="interpreter that has sheeprl")
+    args = parser.parse_args()
+    if args.command == "plot":
+        plot()
+        return
+    th.set_num_threads(1)
+    for seed in args.seed:
+        for env in args.env:
+            for agent in args.agent:
+                path = FOLDER / agent / env / f"seed{seed}.csv"
+                if path.exists():
+                    print(f"{path} is there already")
+                elif agent == "dreamer":
+                    run_dreamer(env, seed, path)
+                else:
+                    run_sheeprl(env, seed, path, args.peer_python)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""
+What the benchmarks that train have in common: fixed evaluation episodes, one CSV per run that appears only when the run is
+complete, means with 95% confidence intervals over seeds.
+"""
+
+import csv
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_cpm.run.evaluation import FIRST_SEED
+
+# two-sided 97.5% quantiles of Student's t, by degrees of freedom
+T_QUANTILE = [np.nan, 12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228]
+
+
+class FixedEpisodes(BaseCallback):
+    """
+    Evaluates before the first step, every ``every`` steps, and at the end, on one and the same episode per environment.
+
+    :param env: as many environments as episodes; environment i starts with seed ``FIRST_SEED + i``
+    :param every: steps between two evaluations
+    :param record: called with the step, the returns and the lengths
+    """
+
+    def __init__(self, env: VecEnv, every: int, record: Callable[[int, list[float], list[int]], None]) -> None:
+        super().__init__()
+        self.env, self.every, self.record = env, every, record
+
+    def _on_training_start(self) -> None:
+        self.evaluate(self.model, 0)
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.every == 0:
+            self.evaluate(self.model, self.num_timesteps)
+        return True
+
+    def evaluate(self, model: BaseAlgorithm, step: int) -> None:
+        self.env.seed(FIRST_SEED)
+        returns, lengths = evaluate_policy(
+            model, self.env, self.env.num_envs, deterministic=True, return_episode_rewards=True, warn=False
+        )
+        self.record(step, returns, lengths)
+
+
+class Table:
+    """
+    Rows of one run; the file gets its name when the run is complete.
+
+    :param path: of the file
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.rows = path, []
+
+    def add(self, **row: Any) -> None:
+        self.rows.append(row)
+
+    def complete(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = self.path.with_suffix(".tmp")
+        with unfinished.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(self.rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self.rows)
+        os.replace(unfinished, self.path)
+
+
+def read(folder: Path) -> list[dict[str, str]]:
+    """:return: rows of all complete runs below a folder"""
+    rows = []
+    for path in sorted(folder.glob("*/*/seed*.csv")):
+        with path.open(newline="", encoding="utf-8") as file:
+            rows += list(csv.DictReader(file))
+    return rows
+
+
+def curves(rows: Iterable[dict[str, str]], value: str) -> dict[tuple[str, str], dict[int, np.ndarray]]:
+    """:return: by (env, agent) and step: the mean over episodes of every seed, in the order of the seeds"""
+    per_seed: dict[tuple[str, str], dict[int, dict[int, list[float]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(list))
+    )
+    for row in rows:
+        per_seed[row["env"], row["agent"]][int(row["step"])][int(row["seed"])].append(float(row[value]))
+    return {
+        key: {step: np.array([np.mean(seeds[seed]) for seed in sorted(seeds)]) for step, seeds in sorted(steps.items())}
+        for key, steps in per_seed.items()
+    }
+
+
+def interval(values: np.ndarray) -> float:
+    """:return: half of the 95% confidence interval of a mean over seeds, by Student's t; nan for a single seed"""
+    return float(T_QUANTILE[len(values) - 1] * values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+
+
+def draw(
+    path: Path,
+    data: dict[tuple[str, str], dict[int, np.ndarray]],
+    envs: Sequence[str],
+    label: str,
+    names: dict[str, str],
+    lines: dict[str, float] | None = None,
+) -> None:
+    """
+    One panel per environment, one line per agent with its confidence interval.
+
+    :param path: of the picture
+    :param data: from :func:`curves`
+    :param envs: those to draw
+    :param label: of the y axis
+    :param names: agents and how the legend calls them
+    :param lines: by environment, a value to mark
+    """
+    figure, axes = plt.subplots(1, len(envs), figsize=(4.6 * len(envs), 3.4), squeeze=False, layout="constrained")
+    for axis, env in zip(axes[0], envs, strict=True):
+        for agent, name in names.items():
+            steps = data.get((env, agent))
+            if not steps:
+                continue
+            x, mean = list(steps), np.array([values.mean() for values in steps.values()])
+            half = np.array([interval(values) for values in steps.values()])
+            n_seeds = max(len(values) for values in steps.values())
+            (line,) = axis.plot(x, mean, label=f"{name} ({n_seeds} seeds)", linewidth=1.8)
+            axis.fill_between(x, mean - half, mean + half, alpha=0.2, color=line.get_color(), linewidth=0)
+        if lines and env in lines:
+            axis.axhline(lines[env], color="grey", linestyle=":", linewidth=1)
+        axis.set(title=env, xlabel="environment steps", ylabel=label)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
