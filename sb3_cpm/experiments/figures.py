@@ -105,7 +105,8 @@ def draw_experiment(experiment: Experiment, results: str | Path, quick: bool = F
     with plt.rc_context(STYLE):
         figure = DRAWINGS[experiment.drawing](experiment, data)
         number = f"Figure {experiment.figure}: " if experiment.figure else ""
-        figure.suptitle(f"{number}{experiment.title}{' (quick version)' if quick else ''}", fontweight="bold")
+        version = f" (quick version, on {', '.join(task.name for task in experiment.quick.tasks)})" if quick else ""
+        figure.suptitle(f"{number}{experiment.title}{version}", fontweight="bold")
     return figure, data.notes
 
 

@@ -187,5 +187,6 @@ def _merged(*overrides: dict[str, Any]) -> dict[str, Any]:
 
     result: dict[str, Any] = {}
     for one in overrides:
-        result = merge(result, one)
+        removed = {key: None for key, value in one.items() if value is None}  # for the file's entries, which come later
+        result = {**merge(result, one), **removed}
     return result

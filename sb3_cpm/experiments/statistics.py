@@ -55,24 +55,25 @@ def estimate(scores: pd.DataFrame, repetitions: int = REPETITIONS) -> Estimate:
             from rliable import library
     except ImportError as error:
         raise RuntimeError('Intervals need a package that is missing: pip install "sb3_cpm[experiments]"') from error
-    from scipy.stats import trim_mean
-
     runs = scores.to_numpy().T[:, None, :]  # (seeds, one task, steps)
 
-    def iqm(values: np.ndarray) -> np.ndarray:
-        return trim_mean(values, proportiontocut=0.25, axis=0)[0]
-
-    if not len(scores):
-        empty = np.zeros(0)
-        return Estimate(empty, empty, empty, empty, runs.shape[0])
+    if not len(scores) or len(runs) == 1:  # nothing to draw from
+        values = runs[0, 0]
+        return Estimate(scores.index.to_numpy(), values, values, values, len(runs))
     state = np.random.get_state()
     np.random.seed(0)  # rliable draws from NumPy's global generator
     try:
-        points, intervals = library.get_interval_estimates({"": runs}, iqm, reps=repetitions)
+        points, intervals = library.get_interval_estimates({"": runs}, _iqm, reps=repetitions)
     finally:
         np.random.set_state(state)
     low, high = intervals[""]
-    return Estimate(scores.index.to_numpy(), np.asarray(points[""]), low, high, runs.shape[0])
+    return Estimate(scores.index.to_numpy(), np.asarray(points[""]), low, high, len(runs))
+
+
+def _iqm(runs: np.ndarray) -> np.ndarray:
+    """Mean without the lowest and the highest quarter of the seeds, per step (``rliable.metrics`` takes all steps as one)."""
+    cut = len(runs) // 4
+    return np.sort(runs[:, 0], axis=0)[cut : len(runs) - cut].mean(axis=0)
 
 
 def binned(table: pd.DataFrame, n_bins: int = 20) -> pd.DataFrame:

@@ -1,0 +1,381 @@
+"""Experiments: resumable runs, their folders, the grid, and figures from CSV alone."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("rliable")
+
+from sb3_cpm.__main__ import main
+from sb3_cpm.experiments import EXPERIMENTS, draw, find_experiment, run_experiment, summary_table
+from sb3_cpm.experiments import single_run as single_run_module
+from sb3_cpm.experiments.catalog import challenger
+from sb3_cpm.experiments.collect import collect
+from sb3_cpm.experiments.evaluation import evaluate
+from sb3_cpm.experiments.grid import attempt, perform_all
+from sb3_cpm.experiments.player_losses import player_losses
+from sb3_cpm.experiments.run_folder import locked
+from sb3_cpm.experiments.single_run import Watcher, perform
+from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
+from sb3_cpm.experiments.statistics import binned, estimate, per_seed
+from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.zoo.agents import load_agent
+
+TINY = {
+    "policy": "MultiInputPolicy",
+    "policy_kwargs": {"net_arch": [8]},
+    "learning_starts": 60,
+    "batch_size": 8,
+    "buffer_size": 500,
+    "train_freq": 10,
+    "gradient_steps": 1,
+    "env_kwargs": {"keys": ["state"]},
+}
+TINY_CPM = {
+    **TINY,
+    **challenger(train_freq=20, challenger_kwargs={"batch_size": 2, "sequence_length": 8, "imagination_starts": 4}),
+}
+
+
+def make_spec(agent="sac", seed=0, steps=200, overrides=None, **changes):
+    return RunSpec(
+        experiment="test",
+        agent=agent,
+        env="toy",
+        seed=seed,
+        config=agent,
+        env_id="CPMToy-v0",
+        overrides={**(TINY_CPM if "cpm" in agent else TINY), **(overrides or {})},
+        steps=steps,
+        eval_every=80,
+        eval_episodes=2,
+        **changes,
+    )
+
+
+class Killed(BaseException):
+    """As abrupt as a signal: nothing of ours catches it."""
+
+
+def kill_at(monkeypatch, step):
+    """The next run is killed when it comes to this step."""
+    unbroken = Watcher._on_step
+
+    def on_step(self):
+        if self.num_timesteps == step:
+            raise Killed
+        return unbroken(self)
+
+    monkeypatch.setattr(Watcher, "_on_step", on_step)
+    return lambda: monkeypatch.setattr(Watcher, "_on_step", unbroken)
+
+
+def csv_files(folder):
+    return {path.name: path.read_text() for path in sorted(folder.glob("*.csv"))}
+
+
+# ---------------------------------------------------------------------- one run
+
+
+def test_run_leaves_tidy_tables(tmp_path):
+    spec = make_spec()
+    lines = []
+    result = perform(spec, tmp_path, lines.append)
+    assert result.outcome == "finished"
+    table = pd.read_csv(result.folder / "evaluations.csv")
+    assert list(table.columns) == [
+        "experiment", "agent", "env", "seed", "step", "episode", "return", "length", "success_once", "success_at_end",
+    ]  # fmt: skip
+    assert table["step"].unique().tolist() == [0, 80, 160, 200]
+    assert table.groupby("step").size().tolist() == [2] * 4
+    assert (table["success_once"] >= table["success_at_end"]).all()
+    training = pd.read_csv(result.folder / "training.csv")
+    assert (training["length"] == 50).all()
+    diagnostics = pd.read_csv(result.folder / "diagnostics.csv")
+    assert {"train/critic_loss", "rollout/ep_rew_mean"} <= set(diagnostics["name"])
+    config = yaml.safe_load((result.folder / "config.yml").read_text())
+    assert config["protocol"]["hyperparameters"]["batch_size"] == 8
+    assert config["sb3_cpm"] and config["versions"]["torch"]
+    assert not (result.folder / "checkpoint").exists() and not (result.folder / ".lock").exists()
+    assert len(lines) == 4 and "step 200/200" in lines[-1]
+
+
+@pytest.mark.parametrize("agent, killed_at", [("sac", 130), ("cpm_sac", 190), ("sac", 30)])
+def test_a_killed_run_goes_on_as_if_unbroken(tmp_path, monkeypatch, agent, killed_at):
+    spec = make_spec(agent)
+    unbroken = perform(spec, tmp_path / "unbroken")
+    revive = kill_at(monkeypatch, killed_at)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path / "broken")
+    revive()
+    loads = []
+    original = single_run_module.checkpoints.load_extra
+    monkeypatch.setattr(single_run_module.checkpoints, "load_extra", lambda path: loads.append(path) or original(path))
+    resumed = perform(spec, tmp_path / "broken")
+    assert loads, "started from the beginning instead of the checkpoint"
+    assert csv_files(resumed.folder) == csv_files(unbroken.folder)
+
+
+def test_hindsight_agent_resumes_too(tmp_path, monkeypatch):
+    """SB3's HerReplayBuffer must have its running episode cut at a checkpoint, which is a fresh start."""
+    pytest.importorskip("gymnasium_robotics")
+    pytest.importorskip("mujoco")
+    overrides = {**TINY, "env_kwargs": {"max_episode_steps": 40}}
+    spec = replace(make_spec("sac_her", overrides=overrides), env_id="PointMaze_UMaze-v3", env="maze")
+    unbroken = perform(spec, tmp_path / "unbroken")
+    revive = kill_at(monkeypatch, 185)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path / "broken")
+    revive()
+    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+
+
+def test_on_policy_agent_resumes_too(tmp_path, monkeypatch):
+    ppo = {
+        "policy": "MultiInputPolicy",
+        "policy_kwargs": {"net_arch": [8]},
+        "n_envs": 2,
+        "n_steps": 20,
+        "batch_size": 20,
+        "n_epochs": 1,
+        "target_kl": None,
+        "env_kwargs": {"keys": ["state"]},
+    }
+    spec = replace(make_spec("ppo_rgbd"), overrides=ppo)
+    unbroken = perform(spec, tmp_path / "unbroken")
+    revive = kill_at(monkeypatch, 130)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path / "broken")
+    revive()
+    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+
+
+def test_the_seed_decides(tmp_path):
+    one, other = (perform(make_spec(seed=seed), tmp_path) for seed in (0, 1))
+    assert csv_files(one.folder)["training.csv"] != csv_files(other.folder)["training.csv"]
+
+
+def test_a_finished_run_is_skipped(tmp_path):
+    spec = make_spec(steps=80)
+    first = perform(spec, tmp_path)
+    before = csv_files(first.folder)
+    started = time.perf_counter()
+    assert perform(spec, tmp_path).outcome == "skipped"
+    assert time.perf_counter() - started < 2
+    assert csv_files(first.folder) == before
+
+
+def test_other_hyperparameters_are_refused_by_name(tmp_path):
+    perform(make_spec(steps=80), tmp_path)
+    result = attempt(make_spec(steps=80, overrides={"batch_size": 16}), tmp_path)
+    assert result.outcome == "refused"
+    assert "batch_size: there 8, here 16" in result.message and "--results" in result.message
+    assert not (result.folder / "crashed.txt").exists()
+
+
+def test_another_version_is_mentioned(tmp_path):
+    spec = make_spec(steps=80)
+    folder = perform(spec, tmp_path).folder
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    (folder / "config.yml").write_text(yaml.safe_dump({**config, "sb3_cpm": "0.0.1"}))
+    result = perform(spec, tmp_path)
+    assert result.outcome == "skipped" and "0.0.1" in result.message
+
+
+def test_two_runs_never_write_one_folder(tmp_path):
+    spec = make_spec(steps=80)
+    code = (
+        "import sys, time, pathlib\nfrom sb3_cpm.experiments.run_folder import locked\n"
+        "with locked(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+    )
+    folder = spec.folder(tmp_path)
+    with subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
+        with pytest.raises(RuntimeError, match=r"is being written by another process \(pid \d+ since"):
+            perform(spec, tmp_path)
+        assert attempt(spec, tmp_path).outcome == "refused"
+        holder.kill()
+    with locked(folder):  # the lock went with its process
+        pass
+
+
+def test_diagnosis_changes_nothing(tmp_path, monkeypatch):
+    spec = make_spec("cpm_sac")
+    diagnosed = perform(spec, tmp_path / "a")
+    names = set(pd.read_csv(diagnosed.folder / "diagnostics.csv")["name"])
+    assert {"player/q_D", "player/q_I", "player/critic_loss_I", "player/actor_loss_D"} <= names
+    monkeypatch.setattr(single_run_module, "log_player_losses", lambda model: None)
+    plain = perform(spec, tmp_path / "b")
+    assert csv_files(diagnosed.folder)["training.csv"] == csv_files(plain.folder)["training.csv"]
+    assert csv_files(diagnosed.folder)["evaluations.csv"] == csv_files(plain.folder)["evaluations.csv"]
+
+
+def test_player_losses_are_those_of_sac():
+    """With a learning rate of zero SAC.train changes nothing, and logs the losses of the batch that it drew."""
+    overrides = {**TINY, "learning_rate": 0.0, "batch_size": 4096, "ent_coef": 0.2}
+    built = load_agent("sac", "CPMToy-v0", overrides).build(seed=0)
+    built.model.learn(100)
+    model = built.model
+    model.train(gradient_steps=5, batch_size=4096)
+    ours = player_losses(model, model.replay_buffer.sample(4096))
+    assert ours["critic_loss"] == pytest.approx(model.logger.name_to_value["train/critic_loss"], rel=0.1)
+    assert ours["actor_loss"] == pytest.approx(model.logger.name_to_value["train/actor_loss"], rel=0.1)
+    built.env.close()
+
+
+def test_evaluation_seeds_every_episode():
+    built = load_agent("sac", "CPMToy-v0", TINY).build(seed=0)
+    env = built.make_eval_env()
+    first = evaluate(built.model, env, 3)
+    assert evaluate(built.model, env, 3) == first
+    assert len({outcome.episode_return for outcome in first}) == 3
+    env.seed(FIRST_SEED)
+    start = env.reset()["state"]
+    evaluate(built.model, env, 1)
+    env.seed(FIRST_SEED)
+    assert np.array_equal(env.reset()["state"], start)
+    env.close(), built.env.close()
+
+
+# ---------------------------------------------------------------------- many runs
+
+
+@pytest.fixture
+def tiny_experiment(monkeypatch):
+    """A catalog entry that takes seconds."""
+    plan = Plan((Task("toy", "CPMToy-v0"),), 120, 60, 2, 2, {"sac": TINY_CPM})
+    player = {key: None for key in ("callback",)}
+    experiment = Experiment(
+        "tiny", "99", "A test", "nothing", (Contender("SAC", "sac", player), Contender("CPM", "cpm_sac")), "curves", plan, plan
+    )
+    broken = replace(
+        experiment, name="broken", contenders=(Contender("bad", "sac", {"batch_size": "eight"}), experiment.contenders[0])
+    )
+    for one in (experiment, broken):
+        monkeypatch.setitem(EXPERIMENTS, one.name, one)
+    return experiment
+
+
+def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
+    results = run_experiment("tiny", quick=False, results=tmp_path, jobs=0, tell=lambda line: None)
+    assert [result.outcome for result in results] == ["finished"] * 4
+    figure = draw("99", tmp_path)
+    labels = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert labels == {"SAC (2 seeds)", "CPM (2 seeds)"}
+    of_return = next(axes for axes in figure.axes if axes.get_title(loc="left") == "return")
+    table = pd.read_csv(tmp_path / "tiny" / "SAC" / "toy" / "seed0" / "evaluations.csv")
+    other = pd.read_csv(tmp_path / "tiny" / "SAC" / "toy" / "seed1" / "evaluations.csv")
+    means = pd.concat([table, other]).groupby("step")["return"].mean()
+    assert np.allclose(of_return.lines[0].get_ydata(), means)
+    summary = summary_table("tiny", tmp_path)
+    assert summary["agent"].tolist() == ["SAC", "CPM"] and (summary["step"] == 120).all()
+    assert f"{means.iloc[-1]:.2f} [" in summary["return"][0]
+    shutil.rmtree(tmp_path / "figures", ignore_errors=True)
+    assert main(["reproduce", "--figure", "tiny", "--draw-only", "--results", str(tmp_path)]) == 0
+    assert (tmp_path / "figures" / "figure_99_tiny.png").stat().st_size > 5000
+    # with other settings than most: left out, and said so
+    config = tmp_path / "tiny" / "CPM" / "toy" / "seed1" / "config.yml"
+    config.write_text(config.read_text().replace("fingerprint: ", "fingerprint: x"))
+    data = collect(tiny_experiment, tmp_path)
+    assert any("left out" in note and "CPM/toy/seed1" in note for note in data.notes)
+    assert data.tables["evaluations"].groupby("agent")["seed"].nunique().to_dict() == {"CPM": 1, "SAC": 2}
+
+
+def test_a_crashed_run_is_recorded_and_the_others_go_on(tmp_path, tiny_experiment):
+    lines = []
+    results = run_experiment("broken", quick=False, results=tmp_path, jobs=0, seeds=1, tell=lines.append)
+    assert [result.outcome for result in results] == ["crashed", "finished"]
+    assert "Traceback" in (results[0].folder / "crashed.txt").read_text()
+    assert main(["reproduce", "--figure", "broken", "--seeds", "1", "--jobs", "0", "--results", str(tmp_path)]) == 1
+
+
+def test_processes_of_their_own(tmp_path):
+    """Two at a time; one is killed from outside."""
+    specs = [make_spec(seed=0, steps=80), make_spec(seed=1, steps=10_000_000)]
+    script = (
+        "import json, sys, pathlib, threading, time, os, signal\n"
+        "from sb3_cpm.experiments import grid\nfrom sb3_cpm.experiments.specification import RunSpec\n"
+        "specs = [RunSpec(**one) for one in json.loads(sys.argv[1])]\nresults = pathlib.Path(sys.argv[2])\n"
+        "pool = grid._Pool(specs, results, 2, print, 'cpu')\n"
+        "def kill():\n"
+        "    folder = specs[1].folder(results)\n"
+        "    while not (folder / 'evaluations.csv').exists() or 0 in pool._running or not pool._running:\n"
+        "        time.sleep(0.1)\n"
+        "    pool._running[1].kill()\n"
+        "threading.Thread(target=kill, daemon=True).start()\n"
+        "print([one.outcome for one in pool.run()])\n"
+    )
+    job = json.dumps([spec.as_dict() for spec in specs])
+    done = subprocess.run([sys.executable, "-c", script, job, str(tmp_path)], capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines()[-1] == "['finished', 'crashed']", done.stdout + done.stderr
+    assert "signal 9" in (specs[1].folder(tmp_path) / "crashed.txt").read_text()
+
+
+def test_jobs_and_seeds_are_checked(tmp_path):
+    with pytest.raises(ValueError, match="jobs=-1"):
+        perform_all([], tmp_path, jobs=-1)
+    with pytest.raises(ValueError, match="seeds=0"):
+        run_experiment("4", seeds=0, results=tmp_path)
+
+
+# ---------------------------------------------------------------------- names, statistics, catalog
+
+
+def test_misspelt_names(tmp_path, capsys):
+    with pytest.raises(ValueError, match="Did you mean 'mountaincar'"):
+        find_experiment("montaincar")
+    assert main(["reproduce", "--figure", "12"]) == 1
+    assert "figures: 3, 4, 5" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"make it with `python -m sb3_cpm reproduce --figure mountaincar --quick --results "):
+        draw("mountaincar", tmp_path, quick=True)
+    assert main(["reproduce", "--list"]) == 0
+    assert "five-agents-training" in capsys.readouterr().out
+
+
+def test_figures_by_number():
+    assert find_experiment("4").name == find_experiment("figure4").name == find_experiment("Figure 4").name == "five-agents"
+    assert find_experiment("B.3").name == "controllers" and find_experiment("b.4").name == "decays"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_planned_run_has_valid_hyperparameters(name, quick):
+    experiment = EXPERIMENTS[name]
+    specs = list(experiment.runs(quick))
+    assert len({spec.name for spec in specs}) == len(specs)
+    for spec in specs:
+        if spec.seed == 0:
+            load_agent(spec.config, spec.env_id, spec.overrides)
+    if experiment.source:
+        of_source = {(spec.agent, spec.env) for spec in EXPERIMENTS[experiment.source].runs(quick)}
+        assert {(spec.agent, spec.env) for spec in specs} <= of_source
+
+
+def test_estimate_is_interquartile_and_covers():
+    generator = np.random.default_rng(0)
+    scores = pd.DataFrame(generator.normal(3.0, 1.0, (2, 12)), index=[0, 100])
+    scores.iloc[0, 0] = 1000.0  # an outlier that a mean would follow
+    result = estimate(scores, repetitions=300)
+    assert result.n_seeds == 12 and result.steps.tolist() == [0, 100]
+    expected = [np.sort(row)[3:9].mean() for row in scores.to_numpy()]
+    assert np.allclose(result.iqm, expected)
+    assert (result.low < result.iqm).all() and (result.iqm < result.high).all() and result.high[0] < 10
+    state = np.random.get_state()[1].copy()
+    again = estimate(scores, repetitions=300)
+    assert np.array_equal(again.low, result.low) and np.array_equal(np.random.get_state()[1], state)
+
+
+def test_scores_are_of_steps_that_all_seeds_have():
+    table = pd.DataFrame({"seed": [0, 0, 0, 1], "step": [0, 0, 10, 0], "return": [1.0, 3.0, 5.0, 4.0]})
+    scores = per_seed(table, "return")
+    assert scores.index.tolist() == [0] and scores.loc[0].tolist() == [2.0, 4.0]
+    assert binned(pd.DataFrame({"step": [0, 1, 5, 10]}), 2)["step"].tolist() == [5, 5, 5, 10]
