@@ -8,8 +8,8 @@ How much of an environment is seen without any reward: share of the cells of a s
 
 The cells are position x velocity on MountainCarContinuous-v0, and positions in the free part of PointMaze_Large-v3, where
 every episode begins in the same corner. All agents have the same episodes (of the same length, without an early end) and the
-same first random steps, and never see a reward. ``plan2explore`` and ``rnd`` are :class:`~sb3_cpm.dreamer.Plan2Explore` with the
-uncertainty class of that name, alike in all else. Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is
+same first random steps, and never see a reward. ``plan2explore`` and ``rnd`` are :class:`~sb3_cpm.dreamer.Plan2Explore` with
+the uncertainty class of that name, alike in all else. Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is
 complete; complete runs are skipped. ``plot`` draws ``results/coverage/coverage.png`` and writes
 ``results/coverage/summary.csv``, means over seeds with 95% confidence intervals.
 """

@@ -26,6 +26,7 @@ import gymnasium as gym
 import torch as th
 from learning_curves import FixedEpisodes, Table, curves, draw, interval, read
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
@@ -36,7 +37,9 @@ FOLDER = Path(__file__).parents[1] / "results" / "dreamer"
 EPISODES = 10
 NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
 TASKS: dict[str, dict[str, Any]] = {
-    "pendulum": dict(id="Pendulum-v1", steps=10_000, every=1000, solved=-200, model={}),
+    "pendulum": dict(
+        id="Pendulum-v1", steps=10_000, every=1000, solved=-200, model=dict(learning_rate=LinearSchedule(1e-3, 1e-4, 1.0))
+    ),
     "toy_camera": dict(
         id="CPMToy-v0",
         env_kwargs=dict(keys=("camera",)),
