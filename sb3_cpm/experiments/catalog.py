@@ -96,7 +96,7 @@ _ALL = (
         "not in the report: a sparse goal task where hindsight applies",
         (SAC, CPM, HER),
         "curves",
-        Plan((POINTMAZE,), 50_000, 5_000, 20, 5, cost="2 to 5 CPU minutes per run"),
+        Plan((POINTMAZE,), 50_000, 5_000, 10, 5, cost="2 to 5 CPU minutes per run"),
         Plan((POINTMAZE,), 4_000, 2_000, 3, 1, cost="1 minute on 2 cores"),
     ),
     Experiment(

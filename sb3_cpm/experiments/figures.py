@@ -51,7 +51,7 @@ def _model(name: str) -> tuple[str, ...]:
 PANELS: dict[str, tuple[Panel, ...]] = {
     "quality": (
         Panel("u, mean of a trajectory", ("challenge/uncertainty",), True),
-        Panel("r, mean of a challenge after relabelling", ("challenge/reward_extrinsic",)),
+        Panel("r, mean of a trajectory", ("challenge/mean_reward",)),
         Panel("c, coefficient of r in the score S = c r + u", ("challenge/c",), True),
     ),
     "filters": (

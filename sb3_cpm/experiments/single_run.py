@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import __version__
+from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.experiments import checkpoint as checkpoints
 from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.evaluation import evaluate, success_of
@@ -149,6 +150,12 @@ class Watcher(BaseCallback):
             self._next_evaluation += self.spec.eval_every
             self._save()
             self._start_afresh()
+
+    def _on_rollout_end(self) -> None:
+        for callback in self.built.callbacks:  # they come before this one
+            if isinstance(callback, ChallengerCallback):
+                for _, proposal in callback.proposals:
+                    self.logger.record_mean("challenge/mean_reward", proposal.rewards[proposal.first :].mean())
 
     def _on_step(self) -> bool:
         for env_idx, info in enumerate(self.locals["infos"]):
