@@ -62,7 +62,11 @@ class FakeManiSkill(gym.Env):
         ids = [SimpleNamespace(per_scene_id=1)] * num_envs
         ground = SimpleNamespace(name="ground", _objs=ids, _scene_idxs=th.arange(num_envs))
         self.scene = SimpleNamespace(
-            actors={"ground": ground}, articulations={}, _reset_mask=th.ones(num_envs, dtype=th.bool), renders=0
+            gpu_sim_enabled=True,
+            actors={"ground": ground},
+            articulations={},
+            _reset_mask=th.ones(num_envs, dtype=th.bool),
+            renders=0,
         )
         self.agent = FakeAgent(self)
         self.torch_seeds: list[int] = []

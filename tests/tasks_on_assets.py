@@ -69,6 +69,24 @@ def test_a_controller_that_the_robot_lacks_is_named_with_those_it_has(env_id: st
         make(env_id, control_mode="pd_ee_pos_delta")
 
 
+# ---------------------------------------------------------------------- start states
+@pytest.mark.parametrize("env_id", REPORT_TASKS)
+def test_the_same_actions_from_a_stored_state(env_id: str) -> None:
+    """Things that slept sleep on: the stand-in of a ball stands on one of its corners, and would roll over if woken."""
+    env = make(env_id, obs_mode="state")
+    env.reset(seed=3)
+    before = [step[0]["state"] for step in play(env, 20)][-1]
+    state = env.get_state()
+    expected = list(play(env, 20, seed=1))
+    env.reset(seed=8)
+    again, _ = env.reset(options={"state": state})
+    np.testing.assert_allclose(again["state"], before, atol=1e-5)
+    for one, other in zip(play(env, 20, seed=1), expected, strict=True):
+        np.testing.assert_allclose(one[0]["state"], other[0]["state"], atol=1e-4)  # metres, radians, and per second
+        assert one[1] == pytest.approx(other[1], abs=1e-5)
+    env.close()
+
+
 # ---------------------------------------------------------------------- light visuals
 @pytest.mark.parametrize(
     "env_id", ["StackCube-v1", "PickSingleYCB-v1", "PickSingleEGAD-v1", "TurnFaucet-v1", "OpenCabinetDrawer-v1"]

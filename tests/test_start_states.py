@@ -113,6 +113,23 @@ def test_pictures_and_clouds_too() -> None:
     env.close()
 
 
+def test_what_sleeps_sleeps_on_and_what_is_awake_is_awake() -> None:
+    env = make("pd_ee_delta_pose")
+    cube = env.unwrapped.cube._bodies[0]  # type: ignore[attr-defined]
+    env.reset(seed=3)
+    early = env.get_state()
+    for _ in range(30):
+        observation = env.step(np.zeros(7))[0]
+    late = env.get_state()
+    assert early["asleep"] == () and late["asleep"] == ("cube",)
+    env.reset(options={"state": early})
+    assert not cube.is_sleeping
+    again, _ = env.reset(options={"state": late})
+    assert cube.is_sleeping
+    np.testing.assert_array_equal(again["state"], observation["state"])
+    env.close()
+
+
 def test_tasks_that_build_a_scene_per_episode() -> None:
     """The geometry is not in the state but follows from the seed, which is."""
     env = make_maniskill_env("PegInsertionSide-v1", obs_mode="state")

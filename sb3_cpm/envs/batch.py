@@ -16,6 +16,7 @@ from gymnasium import spaces
 from sb3_cpm.envs import clouds
 from sb3_cpm.envs import observations as obs_tools
 from sb3_cpm.envs.start_states import StartState, restore, state_of
+from sb3_cpm.envs.thrift import save_work
 from sb3_cpm.envs.visuals import Visuals
 
 OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
@@ -269,6 +270,7 @@ class ManiSkillBatch:
             self._labels = clouds.label_table(_things(self.env))
         for name in set(self.env._sensors) - set(self.cameras):
             del self.env._sensors[name]
+        save_work(self.env)
 
 
 def _things(env: Any) -> list[dict[int, tuple[str, bool]]]:

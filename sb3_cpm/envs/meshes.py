@@ -200,11 +200,16 @@ def _shape(part: Part, scale: np.ndarray, material: Any) -> Any:
             )
     normals = part.normals / scale
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+    corners = np.concatenate(
+        [(part.vertices * scale).reshape(-1, 3), normals.reshape(-1, 3), coordinates.repeat(3, axis=0)], axis=1
+    )
+    # corners that are alike are one vertex: what a renderer computes for each is the larger part of its work
+    vertices, index = np.unique(corners, axis=0, return_inverse=True)
     return sapien.render.RenderShapeTriangleMesh(
-        vertices=(part.vertices * scale).reshape(-1, 3),
-        triangles=np.arange(3 * n, dtype=np.uint32).reshape(n, 3),
-        normals=normals.reshape(-1, 3),
-        uvs=coordinates.repeat(3, axis=0),
+        vertices=vertices[:, :3],
+        triangles=index.astype(np.uint32).reshape(n, 3),
+        normals=vertices[:, 3:6],
+        uvs=vertices[:, 6:],
         material=material,
     )
 
