@@ -33,7 +33,7 @@ def test_the_ensemble_is_k_separate_networks() -> None:
 
 def test_disagreement_is_the_std_over_heads_averaged_over_dimensions() -> None:
     measure, batch = make(), transitions()
-    expected = measure.predict(batch).std(dim=0, correction=0).mean(-1)
+    expected = torch.stack(measure.predict(batch)).std(dim=0, correction=0).mean(-1)
     assert torch.allclose(measure.disagreement(batch), expected, atol=1e-5)
     assert torch.allclose(measure.novelty(batch), torch.expm1(measure.k * expected), rtol=1e-3)
 
@@ -47,7 +47,7 @@ def test_any_batch_dimensions() -> None:
 @pytest.mark.parametrize("target, size", [("feat", 6), ("stoch", 2), ("deter", 4), ("embed", 5)])
 def test_targets(target: str, size: int) -> None:
     measure, batch = make(target=target), transitions()
-    assert measure.targets(batch).shape == (32, size) and measure.predict(batch).shape == (4, 32, size)
+    assert measure.targets(batch).shape == (32, size) and torch.stack(measure.predict(batch)).shape == (4, 32, size)
     assert torch.isfinite(measure.loss(batch))
 
 

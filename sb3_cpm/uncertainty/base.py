@@ -39,8 +39,8 @@ class Transitions(NamedTuple):
         """Whole latent of state t+1, shape ``(*batch, feat_dim)``."""
         return torch.cat((self.next_stoch, self.next_deter), dim=-1)
 
-    def select(self, index: torch.Tensor) -> "Transitions":
-        """Those that an index or a mask picks."""
+    def select(self, index: torch.Tensor | slice) -> "Transitions":
+        """Those that an index, a mask or a slice picks."""
         return Transitions(*(None if part is None else part[index] for part in self))  # type: ignore[arg-type]
 
 

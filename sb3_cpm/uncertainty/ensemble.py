@@ -1,18 +1,24 @@
 """K networks computed as one, and how much they disagree (Lakshminarayanan et al. 2017; Pathak et al. 2019, eq. 1)."""
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import nn
+from torch.autograd.function import once_differentiable
 
-from sb3_cpm.uncertainty.scale import root
+from sb3_cpm.uncertainty.scale import EPSILON, root
+from sb3_cpm.world_model.linear import affine, is_faster
+
+SLICE = 64  # rows of all heads that are worked on at once
 
 
 class Ensemble(nn.Module):
     """
-    K MLPs with ELU and linear outputs, computed as one: every layer is a single batched matrix product.
+    K MLPs with ELU and linear outputs, computed as one: every layer is a single batched matrix product (on CPUs one per head).
 
     :param heads: K
     :param input_dim: size of the input
@@ -44,26 +50,94 @@ class Ensemble(nn.Module):
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = torch.baddbmm(bias, hidden, weight)
             if layer < last:
-                hidden = F.elu(hidden)
+                hidden = F.elu(hidden, inplace=True)
         return hidden
 
+    def predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
+        """The same as a sequence of the heads' outputs, each of shape ``(n, output_dim)``, without copying them together."""
+        return self._one_by_one(inputs) if is_faster(inputs) else self(inputs).unbind(0)
 
-def disagreement(predictions: torch.Tensor) -> torch.Tensor:
+    def _one_by_one(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """On CPUs: a head's layers fit into the cache."""
+        outputs = []
+        last = len(self.weights) - 1
+        weights, biases = ([part.unbind(0) for part in parts] for parts in (self.weights, self.biases))
+        for head in range(self.heads):
+            hidden = inputs
+            for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+                hidden = affine(hidden, weight[head], bias[head][0])
+                if layer < last:
+                    hidden = F.elu(hidden, inplace=True)
+            outputs.append(hidden)
+        return outputs
+
+
+def disagreement(predictions: Sequence[torch.Tensor] | torch.Tensor) -> torch.Tensor:
     """
     Standard deviation over the heads, averaged over the dimensions.
 
-    :param predictions: shape ``(heads, *batch, dim)``
+    :param predictions: of each head, shape ``(*batch, dim)``
     :return: shape ``(*batch,)``, at least 0
     """
-    # by hand: torch.var over a leading dimension takes ten times as long on a CPU
-    return root((predictions - predictions.mean(0)).square().mean(0)).mean(-1)
+    return _Disagreement.apply(*predictions)
 
 
-def ensemble_loss(predictions: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+class _Disagreement(torch.autograd.Function):
+    """
+    :func:`disagreement`, with its gradient by hand: d/dp_k of the standard deviation s is (p_k - mean) / (K * s).
+
+    Imagination rates 12000 states at once, so the predictions are larger than any cache. A slice of rows after the other is
+    read from memory once; composed of PyTorch's operations, each of ten would read and write them all.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *predictions: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(*predictions)
+        dim = predictions[0].shape[-1]
+        slices = zip(*(_slices(one.view(-1, dim)) for one in predictions), strict=True)
+        result = torch.cat([root(_spread(parts)[2]).mean(-1) for parts in slices])
+        return result.view(predictions[0].shape[:-1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        predictions = ctx.saved_tensors
+        dim = predictions[0].shape[-1]
+        results = [torch.empty_like(one) for one in predictions]
+        flat, found = ([_slices(one.view(-1, dim)) for one in many] for many in (predictions, results))
+        scale = _slices(gradient.reshape(-1, 1) / (len(predictions) * dim))
+        for i, weight in enumerate(scale):
+            _, differences, variance = _spread([parts[i] for parts in flat])
+            slope = weight / (variance + EPSILON**2).sqrt_()
+            for difference, parts in zip(differences, found, strict=True):
+                torch.mul(difference, slope, out=parts[i])
+        return tuple(results)
+
+
+def _spread(predictions: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor], torch.Tensor]:
+    """Mean over the heads, their differences from it, and the variance."""
+    mean = predictions[0] + predictions[1]
+    for one in predictions[2:]:
+        mean += one
+    mean /= len(predictions)
+    differences = [one - mean for one in predictions]
+    variance = differences[0].square()
+    for one in differences[1:]:
+        variance.addcmul_(one, one)
+    return mean, differences, variance.div_(len(predictions))
+
+
+def _slices(rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """On a CPU so many rows that those of all heads fit into its caches; on a GPU all."""
+    return rows.split(SLICE) if rows.device.type == "cpu" else (rows,)
+
+
+def ensemble_loss(predictions: Sequence[torch.Tensor] | torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     """
     Squared error summed over heads and dimensions: a head learns the same whatever the number of the others.
 
-    :param predictions: shape ``(heads, n, dim)``
+    :param predictions: of each head, shape ``(n, dim)``
     :param targets: shape ``(n, dim)``
     """
-    return 0.5 * (predictions - targets).square().sum((0, 2)).mean()
+    errors = [F.mse_loss(one, targets, reduction="sum") for one in predictions]
+    return 0.5 * torch.stack(errors).sum() / len(targets)

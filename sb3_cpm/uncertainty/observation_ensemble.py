@@ -36,11 +36,11 @@ class ObservationEnsemble(ScaledUncertainty):
         self.dream = DreamtEmbedding(sizes.feat, sizes.embed, units)
         self.ensemble = Ensemble(heads, sizes.embed + sizes.action, sizes.embed, layers, units)
 
-    def predict(self, transitions: Transitions) -> torch.Tensor:
-        """Predicted standardised embeddings of all heads, shape ``(heads, *batch, embed_dim)``."""
+    def predict(self, transitions: Transitions) -> list[torch.Tensor]:
+        """Predicted standardised embeddings of all heads, each of shape ``(*batch, embed_dim)``."""
         seen = self.dream(transitions.feat, transitions.embed)
         inputs = torch.cat((seen, transitions.action), dim=-1)
-        return self.ensemble(inputs.flatten(0, -2)).unflatten(1, inputs.shape[:-1])
+        return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
 
     def raw(self, transitions: Transitions) -> torch.Tensor:
         return disagreement(self.predict(transitions))

@@ -48,10 +48,10 @@ class Plan2Explore(ScaledUncertainty):
         output_dim = {"feat": sizes.feat, "stoch": sizes.stoch, "deter": sizes.deter, "embed": sizes.embed}[target]
         self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units)
 
-    def predict(self, transitions: Transitions) -> torch.Tensor:
-        """Predictions of all heads, shape ``(heads, *batch, target_dim)``."""
+    def predict(self, transitions: Transitions) -> list[torch.Tensor]:
+        """Predictions of all heads, each of shape ``(*batch, target_dim)``."""
         inputs = torch.cat((transitions.feat, transitions.action), dim=-1)
-        return self.ensemble(inputs.flatten(0, -2)).unflatten(1, inputs.shape[:-1])
+        return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
 
     def disagreement(self, transitions: Transitions) -> torch.Tensor:
         """d: standard deviation over the heads, averaged over the target's dimensions, shape ``(*batch,)``, at least 0."""

@@ -11,8 +11,10 @@ from abc import abstractmethod
 import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions, Uncertainty
+from sb3_cpm.world_model.linear import frozen
 
 METRICS = ("exp", "log")
+MOST_ROWS = 256  # of a batch, evenly spread, tell the scale as much as all of them
 EPSILON = 1e-6  # keeps the gradient of a root finite where there is no novelty at all
 
 
@@ -111,7 +113,8 @@ class ScaledUncertainty(Uncertainty):
         """d: how new on any scale, at least 0, in the manner of a standard deviation, shape ``(*batch,)``."""
 
     def novelty(self, transitions: Transitions) -> torch.Tensor:
-        return self.rate(self.raw(transitions))
+        with frozen(self):  # an actor climbs along its gradient; its own weights learn from the loss
+            return self.rate(self.raw(transitions))
 
     def rate(self, raw: torch.Tensor) -> torch.Tensor:
         """The metric: raw novelty d to novelty, shape as given."""
@@ -124,7 +127,7 @@ class ScaledUncertainty(Uncertainty):
 
     @torch.no_grad()
     def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
-        raw = self.raw(transitions)
+        raw = self.raw(transitions.select(slice(None, None, -(-len(transitions.feat) // MOST_ROWS) or 1)))
         if self.metric == "exp":
             self._adapt_scale(raw)
         return {"raw_disagreement": raw.mean(), "disagreement": self.rate(raw).mean(), "exp_scale": self.k}

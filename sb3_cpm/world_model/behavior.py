@@ -22,6 +22,7 @@ from torch import nn
 
 from sb3_cpm.world_model.acceleration import mixed_precision
 from sb3_cpm.world_model.distributions import TruncatedNormal
+from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.optimizer import Optimizer
@@ -139,7 +140,8 @@ class ActorCritic(nn.Module):
         :return: numbers worth logging, detached scalars
         """
         amp = mixed_precision(start.deter.device, self.preset["amp"])
-        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"):
+        # what the actor learns goes through world model and slow critic, which learn nothing here
+        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"), frozen(world_model, self.target_critic):
             with amp:
                 imagined = self.imagine(world_model, start)
             rewards = reward(imagined)

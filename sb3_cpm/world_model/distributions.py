@@ -7,6 +7,7 @@ stacked, masked and indexed without any bookkeeping.
 """
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +48,14 @@ class GaussianLatent:
     def mean(self, stats: torch.Tensor) -> torch.Tensor:
         return stats[..., : self.size]
 
+    def kl_sides(self, posterior: torch.Tensor, prior: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """
+        KL(posterior || prior) twice, for KL balancing: its gradient reaches the prior only, and the posterior only.
+
+        :return: nats, summed over the dimensions, each of shape ``(*batch,)``
+        """
+        return self.kl(posterior.detach(), prior), self.kl(posterior, prior.detach())
+
     def kl(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         """KL(left || right) in nats, summed over the dimensions, shape ``(*batch,)``."""
         (mean, std), (other_mean, other_std) = self.mean_std(left), self.mean_std(right)
@@ -71,14 +80,15 @@ class CategoricalLatent:
         return stats.unflatten(-1, (self.groups, self.classes))
 
     def noise(self, *batch: int, like: torch.Tensor) -> torch.Tensor:
-        """Gumbel noise for samples of shape ``(*batch, size)``."""
-        return -torch.empty(*batch, self.size, device=like.device, dtype=like.dtype).exponential_().log()
+        """Uniform in [0, 1), one number per variable: thirty times fewer than the Gumbel trick needs, ``(*batch, groups)``."""
+        return torch.rand(*batch, self.groups, device=like.device, dtype=like.dtype)
 
     def sample(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        logits = self._logits(stats)
-        hard = F.one_hot((logits.detach() + self._logits(noise)).argmax(-1), self.classes).to(stats.dtype)
-        probabilities = F.softmax(logits, dim=-1)
-        return (hard + probabilities - probabilities.detach()).flatten(-2)
+        """One-hot sample from the inverse of the cumulative distribution, with the gradient of the probabilities."""
+        probabilities = F.softmax(self._logits(stats), dim=-1)
+        quantiles = probabilities.detach().cumsum(-1)
+        chosen = torch.searchsorted(quantiles, noise.unsqueeze(-1), right=True).clamp_(max=self.classes - 1)
+        return _StraightThrough.apply(probabilities, chosen).flatten(-2)
 
     def mode(self, stats: torch.Tensor) -> torch.Tensor:
         return F.one_hot(self._logits(stats).argmax(-1), self.classes).to(stats.dtype).flatten(-2)
@@ -86,10 +96,31 @@ class CategoricalLatent:
     def mean(self, stats: torch.Tensor) -> torch.Tensor:
         return F.softmax(self._logits(stats), dim=-1).flatten(-2)
 
+    def kl_sides(self, posterior: torch.Tensor, prior: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same as :meth:`GaussianLatent.kl_sides`; both share the logarithms, which are the dear part."""
+        log_posterior = F.log_softmax(self._logits(posterior), dim=-1)
+        log_prior = F.log_softmax(self._logits(prior), dim=-1)
+        probabilities = log_posterior.exp()
+        prior_side = probabilities.detach() * (log_posterior.detach() - log_prior)
+        posterior_side = probabilities * (log_posterior - log_prior.detach())
+        return prior_side.sum((-1, -2)), posterior_side.sum((-1, -2))
+
     def kl(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
         log_left = F.log_softmax(self._logits(left), dim=-1)
         log_right = F.log_softmax(self._logits(right), dim=-1)
         return (log_left.exp() * (log_left - log_right)).sum((-1, -2))
+
+
+class _StraightThrough(torch.autograd.Function):
+    """Exact ones and zeros forwards, and backwards as if they were the probabilities (Bengio et al. 2013)."""
+
+    @staticmethod
+    def forward(ctx: Any, probabilities: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(probabilities).scatter_(-1, chosen, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return gradient, None
 
 
 Latent = GaussianLatent | CategoricalLatent

@@ -1,6 +1,7 @@
 """The losses of Dreamer as pure functions (Hafner et al. 2021, eq. 2, 4 and 5)."""
 
 import torch
+import torch.nn.functional as F
 
 from sb3_cpm.world_model.distributions import Latent
 
@@ -19,13 +20,13 @@ def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 def squared_error(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Negative log-likelihood of a unit-variance Gaussian without its constant, summed over all but the first dimension."""
-    error = 0.5 * (prediction - target).square()
-    return error.flatten(1).sum(1) if error.dim() > 1 else error
+    error = F.mse_loss(prediction, target, reduction="none")  # one pass over the images, forwards and backwards
+    return 0.5 * (error.sum(tuple(range(1, error.dim()))) if error.dim() > 1 else error)
 
 
 def balanced_kl(
     latent: Latent, posterior: torch.Tensor, prior: torch.Tensor, mask: torch.Tensor, balance: float, free_nats: float
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """
     KL loss that moves the prior towards the posterior faster than the other way round (DreamerV2, algorithm 2).
 
@@ -37,10 +38,11 @@ def balanced_kl(
     :param mask: rows that count, shape ``(*batch,)``
     :param balance: share of the prior's side, 0.8 in DreamerV2
     :param free_nats: nats that cost nothing
+    :return: the loss, and the KL's mean as it is, without gradient
     """
-    prior_side = masked_mean(latent.kl(posterior.detach(), prior), mask).clamp(min=free_nats)
-    posterior_side = masked_mean(latent.kl(posterior, prior.detach()), mask).clamp(min=free_nats)
-    return balance * prior_side + (1.0 - balance) * posterior_side
+    prior_side, posterior_side = (masked_mean(side, mask) for side in latent.kl_sides(posterior, prior))
+    loss = balance * prior_side.clamp(min=free_nats) + (1.0 - balance) * posterior_side.clamp(min=free_nats)
+    return loss, prior_side.detach()
 
 
 def lambda_returns(rewards: torch.Tensor, values: torch.Tensor, discounts: torch.Tensor, lambda_: float) -> torch.Tensor:

@@ -8,6 +8,7 @@ slowly here: open-loop pixel error after 300 updates of a moving square 0.074 in
 import torch
 from torch import nn
 
+from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
 
 
@@ -29,10 +30,10 @@ class MLP(nn.Sequential):
     def __init__(self, input_dim: int, layers: int, units: int, output_dim: int | None = None) -> None:
         modules: list[nn.Module] = []
         for _ in range(layers):
-            modules += [nn.Linear(input_dim, units), nn.ELU()]
+            modules += [Linear(input_dim, units), nn.ELU(inplace=True)]
             input_dim = units
         if output_dim is not None:
-            modules.append(nn.Linear(input_dim, output_dim))
+            modules.append(Linear(input_dim, output_dim))
         super().__init__(*modules)
         self.output_dim = input_dim if output_dim is None else output_dim
 
@@ -49,7 +50,7 @@ class GRUCell(nn.Module):
 
     def __init__(self, input_dim: int, size: int) -> None:
         super().__init__()
-        self.gates = nn.Linear(input_dim + size, 3 * size, bias=False)
+        self.gates = Linear(input_dim + size, 3 * size, bias=False)
         # after a reset memory, state and action are all zero: a smaller eps would blow up the gradient there
         self.norm = nn.LayerNorm(3 * size, eps=1e-3)
 
@@ -99,7 +100,7 @@ class ConvEncoder(nn.Module):
         modules: list[nn.Module] = []
         for layer in range(layers):
             out = depth * min(2**layer, 8)
-            modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), nn.ELU()]
+            modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), nn.ELU(inplace=True)]
             channels = out
         self.convolutions = channels_last(nn.Sequential(*modules))
         self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
@@ -124,10 +125,10 @@ class ConvDecoder(nn.Module):
         layers = cnn_layer_count(height, width, layers)
         widths = [depth * min(2**layer, 8) for layer in reversed(range(layers))]
         self.feature_map = (widths[0], height // 2**layers, width // 2**layers)
-        self.linear = nn.Linear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2])
+        self.linear = Linear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2])
         modules: list[nn.Module] = []
         for narrow, wide in zip([*widths[1:], channels], widths, strict=True):
-            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU()]
+            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU(inplace=True)]
         self.convolutions = channels_last(nn.Sequential(*modules[:-1]))
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_cpm.world_model.distributions import Latent
+from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.networks import GRUCell
 
 
@@ -66,13 +67,15 @@ class RSSM(nn.Module):
         self.latent = latent
         self.deter_size = deter_size
         self.feat_dim = latent.size + deter_size
-        self.input_stoch = nn.Linear(latent.size, hidden_size)
-        self.input_action = nn.Linear(action_dim, hidden_size, bias=False)
+        self.input_stoch = Linear(latent.size, hidden_size)
+        self.input_action = Linear(action_dim, hidden_size, bias=False)
         self.gru = GRUCell(hidden_size, deter_size)
-        self.prior_net = nn.Sequential(nn.Linear(deter_size, hidden_size), nn.ELU(), nn.Linear(hidden_size, latent.stats_size))
-        self.posterior_deter = nn.Linear(deter_size, hidden_size)
-        self.posterior_embed = nn.Linear(embed_dim, hidden_size, bias=False)
-        self.posterior_out = nn.Linear(hidden_size, latent.stats_size)
+        self.prior_net = nn.Sequential(
+            Linear(deter_size, hidden_size), nn.ELU(inplace=True), Linear(hidden_size, latent.stats_size)
+        )
+        self.posterior_deter = Linear(deter_size, hidden_size)
+        self.posterior_embed = Linear(embed_dim, hidden_size, bias=False)
+        self.posterior_out = Linear(hidden_size, latent.stats_size)
 
     def forward(self, stoch: torch.Tensor, action_in: torch.Tensor, deter: torch.Tensor) -> torch.Tensor:
         """

@@ -89,15 +89,15 @@ class WorldModel(nn.Module):
         posterior = self.rssm.observe(embed, batch.actions, batch.is_first)
         prior = self.rssm.prior(posterior.deter)
         feat = posterior.feat
-        kl = balanced_kl(self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"])
-        losses = {"kl": self.preset["kl_scale"] * kl}
-        metrics = {}
+        kl_loss, kl = balanced_kl(
+            self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"]
+        )
+        losses = {"kl": self.preset["kl_scale"] * kl_loss}
+        metrics = {"kl": kl}
         reconstructions, errors = self._reconstruction_losses(feat, batch)
         losses.update(reconstructions)
         metrics.update(errors)
         losses.update(self._head_losses(feat, batch))
-        with torch.no_grad():
-            metrics["kl"] = masked_mean(self.latent.kl(posterior.stats, prior), batch.mask)
         return WorldModelOutput(losses, metrics, posterior.detach(), embed.detach())
 
     def _reconstruction_losses(
@@ -108,13 +108,15 @@ class WorldModel(nn.Module):
         mask = batch.mask.flatten()
         if decoded.images is not None and batch.inputs.images is not None:
             losses["image"] = masked_mean(squared_error(decoded.images, batch.inputs.images), mask)
-            with torch.no_grad():  # the report's measure of Fig. 10b, on the scale of [-0.5, 0.5]
-                error = (decoded.images - batch.inputs.images).abs().mean((1, 2, 3))
-                metrics["pixel_error"] = masked_mean(error, mask)
         if decoded.vectors is not None and batch.inputs.vectors is not None:
             losses["vector"] = masked_mean(squared_error(decoded.vectors, batch.inputs.vectors), mask)
         with torch.no_grad():
             metrics.update({f"error_{key}": masked_mean(one, mask) for key, one in self.spec.errors(decoded, batch.inputs)})
+        if decoded.images is not None:  # the report's measure of Fig. 10b, on the scale of [-0.5, 0.5]
+            cameras = zip(self.spec.image_keys, self.spec.channels, strict=True)
+            metrics["pixel_error"] = torch.stack([n * metrics[f"error_{key}"] for key, n in cameras]).sum() / len(
+                decoded.images[0]
+            )
         return losses, metrics
 
     def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> dict[str, torch.Tensor]:
