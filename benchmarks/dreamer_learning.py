@@ -77,7 +77,7 @@ def run_sheeprl(env: str, seed: int, path: Path, python: str) -> None:
     settings = dict(
         env=env, id=task["id"], seed=seed, steps=task["steps"], every=task["every"], episodes=EPISODES, path=str(path),
         learning_starts=task["model"].get("learning_starts", 1000), train_freq=5,
-        preset=make_preset(task["model"].get("preset", {})),
+        preset=make_preset(task["model"].get("preset", {})), env_kwargs=task.get("env_kwargs"),
     )  # fmt: skip
     script = Path(__file__).parent / "peers" / "sheeprl_learning.py"
     subprocess.run([python, str(script), json.dumps(settings)], check=True)

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import is_vectorized_observation
+from typing_extensions import Self
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer.spaces import OBSERVATION, as_dict, as_dict_space
@@ -76,6 +77,12 @@ class DreamerPolicy(BasePolicy):
     def optimizer_names(self) -> list[str]:
         """Attributes that hold optimizers."""
         return [f"{name}_optimizer" for name in self.challenger.optimizers]
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """As ``torch.nn.Module.to``; what it is given to read goes there, too."""
+        moved = super().to(*args, **kwargs)
+        self.challenger.device = self.device
+        return moved
 
     def get_extra_state(self) -> th.Tensor:
         """Part of ``state_dict()``: the number of updates."""
