@@ -81,7 +81,7 @@ def main(env: str, id: str, seed: int, steps: int, every: int, episodes: int, pa
     start = time.process_time()
     th.set_num_threads(1)
     set_random_seed(seed)
-    train_env, test_env = (make_vec_env(id, n, seed=seed, env_kwargs=settings["env_kwargs"]) for n in (1, episodes))
+    train_env, test_env = (make_vec_env(id, n, seed=seed) for n in (1, episodes))
     train_env.action_space.seed(seed)
     space = as_dict_space(train_env.observation_space)
     peer = SheeprlDreamer(settings["preset"], space, train_env.action_space.shape[0])
