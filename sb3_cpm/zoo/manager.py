@@ -3,7 +3,8 @@ Three methods of rl_zoo3's ``ExperimentManager``, wrapped: what they did, they d
 
 =========================  ===============================================================================================
 ``read_hyperparameters``   also names misspelt keys, before anything is built (:mod:`sb3_cpm.zoo.checks`), and puts our part of
-                           a trial (``--trial-id``) where it belongs (:mod:`sb3_cpm.zoo.search`)
+                           a trial (``--trial-id``) where it belongs (:mod:`sb3_cpm.zoo.search`); evaluation environments get
+                           the ``env_kwargs`` of the configuration, as training environments do
 ``learn``                  also saves the challenger, and goes on where the run stopped with ``-i`` (:mod:`sb3_cpm.zoo.resume`)
 ``objective``              also samples our arguments with ``--optimize`` (:mod:`sb3_cpm.zoo.search`)
 =========================  ===============================================================================================
@@ -31,6 +32,8 @@ def _reading(original: Callable[..., Any]) -> Callable[..., Any]:
         checks.check_environment_names(manager.config, manager.env_name.gym_id)
         hyperparameters, _ = original(manager)
         hyperparameters = search.with_trial(hyperparameters, manager)
+        if manager._eval_env_kwargs_args is None and "env_kwargs" in hyperparameters:
+            manager.eval_env_kwargs = hyperparameters["env_kwargs"]  # rl_zoo3 gives them to the training environments only
         checks.check_hyperparameters(hyperparameters, manager.algo, manager.env_name.gym_id, manager.config)
         return hyperparameters, dict(sorted(hyperparameters.items()))
 

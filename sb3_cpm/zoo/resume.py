@@ -5,7 +5,8 @@ Beside ``ENV.zip`` rl_zoo3 writes ``replay_buffer.pkl`` (with ``--save-replay-bu
 tolerances and reward memory. We add ``challenger.pt``; beside a checkpoint ``rl_model_N_steps.zip`` (``--save-freq``) it is
 ``rl_model_challenger_N_steps.pt``, and with ``--save-replay-buffer`` the buffer is brought up to date then too.
 
-rl_zoo3 starts ``-i`` at step 0, so it would repeat the random actions of ``learning_starts``; here the count goes on.
+rl_zoo3 starts ``-i`` at step 0, so it would repeat the random actions of ``learning_starts``; here the count goes on. The
+continued run has a folder of its own; its ``evaluations.npz`` begins with those of the run that it continues.
 """
 
 import contextlib
@@ -14,8 +15,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cpm.callbacks import ChallengerCallback
@@ -36,6 +38,7 @@ def kept(manager: Any, model: BaseAlgorithm) -> Iterator[Any]:
     challengers = [callback for callback in manager.callbacks if isinstance(callback, ChallengerCallback)]
     if manager.continue_training:
         _go_on(Path(manager.trained_agent), model, challengers)
+        _remember_evaluations(Path(manager.trained_agent), model, manager.callbacks)
         # not once more the start states and random numbers that the first run began with
         model.set_random_seed(manager.seed + model.num_timesteps)
     if manager.save_freq > 0:
@@ -123,6 +126,23 @@ def _go_on(trained_agent: Path, model: BaseAlgorithm, challengers: Sequence[Chal
             "repeated to fill it"
         )
         model.learning_starts += model.num_timesteps
+
+
+def _remember_evaluations(trained_agent: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
+    """So that plots show the whole curve."""
+    path = trained_agent.with_name("evaluations.npz")
+    if not path.is_file():
+        return
+    with np.load(path) as log:
+        known = log["timesteps"] <= model.num_timesteps
+        past = {name: log[name][known].tolist() for name in log.files if len(log[name]) == len(known)}
+    for callback in callbacks:
+        # a table: evaluations of other lengths do not fit into it
+        if isinstance(callback, EvalCallback) and all(len(row) == callback.n_eval_episodes for row in past["results"]):
+            callback.evaluations_timesteps += past["timesteps"]
+            callback.evaluations_results += past["results"]
+            callback.evaluations_length += past["ep_lengths"]
+            callback.evaluations_successes += past.get("successes", [])
 
 
 def _filled(model: OffPolicyAlgorithm) -> bool:

@@ -1,0 +1,633 @@
+"""The bridge to rl_zoo3: ids, configurations, checks, search spaces, continued runs, and its commands from end to end."""
+
+import argparse
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import standin_assets
+import torch as th
+import yaml
+from gymnasium import spaces
+from rl_zoo3 import exp_manager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import ALGOS
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import BitFlippingEnv
+
+from sb3_cpm import ChallengerCallback, CPMBuffer
+from sb3_cpm.challenger import Challenger
+from sb3_cpm.dreamer import Dreamer, Plan2Explore
+from sb3_cpm.zoo import ENV_IDS, TASKS, env_id_of, search
+from sb3_cpm.zoo.__main__ import complete, main
+from sb3_cpm.zoo.agents import config_folder, load_agent
+from sb3_cpm.zoo.bridge import install
+from sb3_cpm.zoo.checks import read_entries
+from sb3_cpm.zoo.policies import CameraExtractor
+from sb3_cpm.zoo.resume import challenger_file
+from sb3_cpm.zoo.wrappers import RGBD, TerminationIsSuccess, as_dict
+
+CONFIGS = sorted(config_folder().glob("*.yml"))
+ENTRIES = [(path.stem, name) for path in CONFIGS for name in read_entries(path) if not name.startswith(".")]
+TOY = "CPMToy-v0"
+
+
+def known(env_id: str) -> bool:
+    return env_id in gym.registry or env_id == "default"
+
+
+# ---------------------------------------------------------------------- ids and names
+def test_tasks_are_registered_without_importing_maniskill() -> None:
+    assert len(ENV_IDS) == 2 * len(TASKS) == 14 and all(env_id in gym.registry for env_id in ENV_IDS)
+    assert env_id_of("TurnFaucet-v1", state=True) == "CPM/TurnFaucetState-v1"
+    script = "import sys, sb3_cpm.zoo; print([name for name in ('mani_skill', 'sapien') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_rl_zoo3_knows_our_names() -> None:
+    before = {algo: HYPERPARAMS_SAMPLER[algo] for algo in search.PLAYERS}
+    method = exp_manager.ExperimentManager.learn
+    install()  # once more: nothing is wrapped twice
+    assert before == {algo: HYPERPARAMS_SAMPLER[algo] for algo in search.PLAYERS}
+    assert exp_manager.ExperimentManager.learn is method
+    assert eval("CPMHerReplayBuffer", vars(exp_manager)) is CPMBuffer
+    assert (ALGOS["dreamer"], ALGOS["plan2explore"], ALGOS["sac"]) == (Dreamer, Plan2Explore, SAC)
+
+
+# ---------------------------------------------------------------------- the files
+@pytest.mark.parametrize("name, env_id", ENTRIES)
+def test_entries_have_only_keys_that_somebody_takes(name: str, env_id: str) -> None:
+    if env_id.startswith("PointMaze"):
+        pytest.importorskip("gymnasium_robotics")
+    agent = load_agent(name, TOY if env_id == "default" else env_id)
+    assert agent.n_timesteps >= 20_000 and agent.n_envs >= 1
+
+
+def test_every_file_has_the_seven_tasks_and_a_default() -> None:
+    assert len(CONFIGS) == 9
+    for path in CONFIGS:
+        assert {"default", *(env_id_of(task) for task in TASKS)} <= set(read_entries(path)), path
+
+
+def test_agents_that_are_compared_differ_in_what_is_compared() -> None:
+    cpm, slow, plain = (
+        read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_high_exploration", "sac")
+    )
+    for env_id, entry in cpm.items():
+        assert {**entry, "callback": None} == {**slow[env_id], "callback": None}
+        assert entry["callback"] != slow[env_id]["callback"]
+        if env_id in plain:
+            same = set(entry) - {"callback", "replay_buffer_class", "replay_buffer_kwargs", "env_wrapper", "policy"}
+            assert {key: entry[key] for key in same} == {key: plain[env_id][key] for key in same}, env_id
+    assert cpm["CPM/PickCube-v1"]["policy"] == plain["CPM/PickCube-v1"]["policy"] == "sb3_cpm.PointNetPolicy"
+
+
+def test_report_has_the_constants_of_the_report() -> None:
+    agent = load_agent("cpm_sac_report", "CPM/PickCube-v1")
+    constants = agent.hyperparameters
+    assert constants["buffer_size"] == 50 * 50 and constants["gradient_steps"] == 6
+    assert constants["replay_buffer_kwargs"] == {"challenge_ratio": 0.25, "mix": "batch", "max_challenges": 10}
+    assert load_agent("cpm_sac_report", "CPM/TurnFaucet-v1").hyperparameters["buffer_size"] == 50 * 200
+    assert load_agent("cpm_sac_report", "CPM/OpenCabinetDoor-v1").hyperparameters["buffer_size"] == 50 * 100
+
+
+SHORT = {
+    "ppo": {"n_envs": 1, "n_steps": 60, "batch_size": 60, "n_epochs": 1},
+    "off-policy": {"learning_starts": 50, "train_freq": 20, "gradient_steps": 1},
+}
+
+
+def short(name: str) -> dict[str, Any]:
+    return SHORT["ppo" if name.startswith("ppo") else "off-policy"]
+
+
+@pytest.mark.parametrize("name", [path.stem for path in CONFIGS if path.stem != "sac_her"])
+def test_default_entry_trains_on_a_dict_environment(name: str) -> None:
+    built = load_agent(name, TOY, {**short(name), "batch_size": 32} if "sac" in name else short(name)).build(0, device="cpu")
+    if name == "cpm_sac_report":  # an update of a challenger of that size takes seconds
+        built.callbacks[0].gradient_steps = 0  # type: ignore[attr-defined]
+    built.model.learn(60, callback=built.callbacks)
+    assert built.model._n_updates > 0
+    if name.startswith("cpm"):
+        assert isinstance(built.callbacks[0], ChallengerCallback) and built.callbacks[0].challenger is not None
+    evaluation = built.make_eval_env()
+    action, _ = built.model.predict(evaluation.reset(), deterministic=True)  # type: ignore[arg-type]
+    evaluation.step(action)
+    evaluation.close()
+    built.env.close()
+
+
+def test_default_entry_of_hindsight_trains_on_goals_and_refuses_others() -> None:
+    if "BitFlips-v0" not in gym.registry:
+        gym.register(
+            "BitFlips-v0", entry_point=lambda **kwargs: BitFlippingEnv(continuous=True, **kwargs), max_episode_steps=8
+        )
+    built = load_agent("sac_her", "BitFlips-v0", {"learning_starts": 20, "batch_size": 8}).build(0, device="cpu")
+    built.model.learn(30)
+    assert built.model._n_updates == 10
+    with pytest.raises(ValueError, match="desired_goal"):
+        load_agent("sac_her", TOY).build(0, device="cpu")
+
+
+@pytest.mark.parametrize("name", ["sac", "cpm_sac", "dreamer", "plan2explore"])
+def test_mountain_car_trains(name: str) -> None:
+    overrides = {"learning_starts": 1000, "env_kwargs": {"max_episode_steps": 20}}
+    built = load_agent(name, "MountainCarContinuous-v0", overrides).build(0, device="cpu")
+    built.model.learn(25, callback=built.callbacks)
+    assert built.model.num_timesteps == 25
+    built.env.close()
+
+
+@pytest.mark.parametrize("name", ["sac", "sac_her", "cpm_sac"])
+def test_point_maze_trains(name: str) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    built = load_agent(name, "PointMaze_UMaze-v3").build(0, device="cpu")
+    built.model.learn(4, callback=built.callbacks)
+    built.env.close()
+
+
+# ---------------------------------------------------------------------- all agents on all tasks
+@pytest.fixture(scope="module")
+def standins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("assets")
+    standin_assets.make_all(folder)
+    return folder
+
+
+def run(arguments: list[str], folder: Path, **environment: str) -> str:
+    """:return: what the command printed; it must end well"""
+    root = str(Path(__file__).resolve().parents[1])
+    variables = {**os.environ, "PYTHONPATH": root, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1", **environment}
+    command = [sys.executable, "-W", "ignore", *arguments]
+    done = subprocess.run(
+        command, env=variables, cwd=folder, capture_output=True, text=True, timeout=900, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout[-3000:]}\n{done.stderr[-5000:]}"
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.maniskill
+def test_all_agents_on_all_tasks(standins: Path, tmp_path: Path) -> None:
+    here = Path(__file__).parent
+    output = run(
+        [
+            "-m",
+            "pytest",
+            "-q",
+            "-p",
+            "no:cacheprovider",
+            "-c",
+            str(here.parent / "pyproject.toml"),
+            str(here / "zoo_on_assets.py"),
+        ],
+        tmp_path,
+        MS_ASSET_DIR=str(standins),
+    )
+    assert "skipped" not in output
+
+
+# ---------------------------------------------------------------------- bad input
+def edited(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    entries = yaml.safe_load((config_folder() / "cpm_sac.yml").read_text())
+    change(entries["default"])
+    path = folder / "my_sac.yml"
+    path.write_text(yaml.safe_dump({"default": entries["default"]}))
+    return path
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"gama": 0.9}, "unknown key 'gama'. Did you mean 'gamma'"),
+        ({"n_timestep": 5}, "Did you mean 'n_timesteps'"),
+        ({"replay_buffer_kwargs": {"challange_ratio": 0.1}}, "replay_buffer_kwargs: .*Did you mean 'challenge_ratio'"),
+        ({"policy_kwargs": {"net_arhc": [3]}}, "policy_kwargs: .*Did you mean 'net_arch'"),
+        ({"callback": {"sb3_cpm.ChallengerCallback": {"trainfreq": 1}}}, "ChallengerCallback: .*Did you mean 'train_freq'"),
+        ({"callback": "sb3_cpm.ChalengerCallback"}, "sb3_cpm has no 'ChalengerCallback'. Did you mean 'ChallengerCallback'"),
+        ({"callback": "sb3_cmp.ChallengerCallback"}, "cannot import 'sb3_cmp.ChallengerCallback'"),
+        ({"env_wrapper": {"sb3_cpm.zoo.wrappers.RGBD": {"max_dept": 1}}}, "RGBD: .*Did you mean 'max_depth'"),
+        ({"policy": None}, "policy must be there"),
+    ],
+)
+def test_misspelt_keys_name_the_nearest(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    def apply(entry: dict[str, Any]) -> None:
+        entry.update(change)
+        for key in [key for key, value in change.items() if value is None]:
+            del entry[key]
+
+    path = edited(tmp_path, apply)
+    with pytest.raises(ValueError, match=message):
+        load_agent(path, TOY)
+    with pytest.raises(ValueError, match=message):
+        manager_of("sac", tmp_path, 10, config=str(path)).setup_experiment()
+    assert not list(tmp_path.glob("sac/*")), "something was built before the error"
+
+
+def test_misspelt_environments_name_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="Unknown environment 'CPM/PickCub-v1'. Did you mean 'CPM/PickCube-v1'"):
+        load_agent("sac", "CPM/PickCub-v1")
+    path = tmp_path / "my_sac.yml"
+    entry = read_entries(config_folder() / "sac.yml")["default"]
+    for wrong, asked, message in (
+        ("CPM/PickCub-v1", "CPM/PickCube-v1", "no environment 'CPM/PickCub-v1'. Did you mean 'CPM/PickCube-v1'"),
+        ("MountainCarContinous-v0", "MountainCarContinuous-v0", "did you mean 'MountainCarContinuous-v0'"),
+    ):
+        path.write_text(yaml.safe_dump({wrong: entry, "default": entry}))
+        with pytest.raises(ValueError, match=message):
+            load_agent(path, asked)
+    path.write_text(yaml.safe_dump({TOY: entry}))
+    with pytest.raises(ValueError, match="neither an entry 'Pendulum-v1' nor a default"):
+        load_agent(path, "Pendulum-v1")
+    # another version is no slip, and neither is what another package registers
+    path.write_text(yaml.safe_dump({"Pendulum-v0": entry, "MinitaurBulletEnv-v0": entry, "default": entry}))
+    assert load_agent(path, "Pendulum-v1").algo == "sac"
+
+
+@pytest.mark.parametrize(
+    "text, message", [("a: [", "is not YAML"), ("- a", "expected hyperparameters by environment"), ("default: 3", "a mapping")]
+)
+def test_files_that_are_no_configurations(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "my_sac.yml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_agent(path, TOY)
+
+
+def test_arguments_of_our_tasks_are_checked() -> None:
+    with pytest.raises(ValueError, match="env_kwargs: unknown key 'image_sise'. Did you mean 'image_size'"):
+        load_agent("sac", "CPM/PickCube-v1", {"env_kwargs": {"image_sise": 16}})
+    assert load_agent("sac", "CPM/PickCube-v1", {"env_kwargs": {"robot_init_qpos_noise": 0.1}}).algo == "sac"  # ManiSkill's
+
+
+# ---------------------------------------------------------------------- wrappers and policies
+def test_wrappers() -> None:
+    env = as_dict(gym.make("Pendulum-v1"))
+    assert list(env.observation_space.spaces) == ["state"]  # type: ignore[attr-defined]
+    assert as_dict(env) is env
+    car = TerminationIsSuccess(gym.make("MountainCarContinuous-v0"))
+    car.reset(seed=0)
+    assert car.step(car.action_space.sample())[-1]["is_success"] is False
+    car.unwrapped.state = np.array([0.449, 0.07])  # type: ignore[attr-defined]
+    assert car.step(np.array([1.0], dtype=np.float32))[-1]["is_success"] is True
+    with pytest.raises(ValueError, match="RGBD needs a task of make_maniskill_env with cameras"):
+        RGBD(gym.make("Pendulum-v1"))
+
+
+@pytest.mark.maniskill
+def test_depth_is_how_far_away_things_are() -> None:
+    plain = gym.make("CPM/PickCube-v1", image_size=32, n_points=0)
+    env = RGBD(plain, max_depth=2.0)
+    observation, _ = env.reset(seed=5)
+    assert env.observation_space.contains(observation)
+    first = observation["base_camera"]
+    env.step(np.array([0, 0, 1, 0, 0, 0, 1], dtype=np.float32))
+    twice, _ = env.reset(seed=5)
+    assert (twice["base_camera"] == first).all()
+    camera = plain.get_wrapper_attr("batch").env._sensors["base_camera"]
+    # the middle of the picture shows the table: where the camera's axis meets z = 0
+    pose = camera.camera.get_model_matrix()[0].cpu().numpy()
+    eye, forward = pose[:3, 3], -pose[:3, 2]
+    expected = -eye[2] / forward[2]
+    assert first[20:, :, 3].max() < 255 and first[0, :, 3].max() == 255  # table below, the horizon above
+    assert np.median(first[15:17, :8, 3]) * 2.0 / 255 == pytest.approx(expected, rel=0.15)
+    seen, _ = plain.reset(seed=5)
+    assert (seen["base_camera"] == first[..., :3]).all()
+    assert RGBD(plain, max_depth=1.0).observation(seen)["base_camera"][20:, :, 3] == pytest.approx(
+        2.0 * first[20:, :, 3], abs=2
+    )
+    with pytest.raises(ValueError, match="expected more than 0 metres"):
+        RGBD(plain, max_depth=0)
+    with pytest.raises(ValueError, match="with cameras"):
+        RGBD(gym.make("CPM/PickCubeState-v1"))
+
+
+def test_camera_extractor_reads_pictures_and_vectors() -> None:
+    space = spaces.Dict(
+        {
+            "cloud": spaces.Box(-1, 1, (20, 6), np.float32),
+            "camera": spaces.Box(0, 255, (4, 32, 32), np.uint8),
+            "state": spaces.Box(-1, 1, (5,), np.float32),
+        }
+    )
+    extractor = CameraExtractor(space)
+    assert extractor.player_keys == ("camera", "state") and extractor.features_dim == 128 + 64
+    assert CameraExtractor(space, keys=["state"]).features_dim == 64
+    model = load_agent("ppo_rgbd", TOY, short("ppo")).build(0, device="cpu").model
+    assert isinstance(model.policy.features_extractor, CameraExtractor)
+    assert model.policy.features_extractor.cloud_keys == []
+
+
+# ---------------------------------------------------------------------- search spaces
+class FixedTrial:
+    """A trial of Optuna that takes the first or the lowest of everything."""
+
+    def __init__(self) -> None:
+        self.params: dict[str, Any] = {}
+
+    def suggest_float(self, name: str, low: float, high: float, log: bool = False) -> float:
+        return self.params.setdefault(name, low)
+
+    def suggest_int(self, name: str, low: int, high: int) -> int:
+        return self.params.setdefault(name, low)
+
+    def suggest_categorical(self, name: str, choices: list[Any]) -> Any:
+        return self.params.setdefault(name, choices[0])
+
+    def set_user_attr(self, name: str, value: Any) -> None:
+        pass
+
+
+def manager_of(algo: str, folder: Path, n_timesteps: int, **kwargs: Any) -> exp_manager.ExperimentManager:
+    """What ``python -m rl_zoo3.train`` makes, without evaluations."""
+    arguments = {"eval_freq": -1, "log_interval": -1, "verbose": 0, "device": "cpu", **kwargs}
+    return exp_manager.ExperimentManager(argparse.Namespace(), algo, TOY, str(folder), n_timesteps=n_timesteps, **arguments)
+
+
+@pytest.mark.parametrize("algo", search.PLAYERS)
+def test_trials_merge_with_the_configuration(algo: str, tmp_path: Path) -> None:
+    manager = manager_of(algo, tmp_path, 10)
+    manager._hyperparams = {
+        "policy_kwargs": {"share_features_extractor": False},
+        "replay_buffer_kwargs": {"filter_kwargs": {"w1": 3.0}},
+    }
+    manager.specified_callbacks = [
+        "rl_zoo3.callbacks.RawStatisticsCallback",
+        {"sb3_cpm.ChallengerCallback": {"preset": "report"}},
+    ]
+    before = copy.deepcopy(vars(manager)["_hyperparams"])
+    trial = FixedTrial()
+    with search.sampled(manager, trial) as changed:
+        of_player = HYPERPARAMS_SAMPLER[algo](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+    buffer = changed._hyperparams["replay_buffer_kwargs"]
+    assert buffer == {"filter_kwargs": {"w1": 3.0}, "challenge_ratio": 0.05, "mix": "batch", "max_challenges": 5}
+    (path, kwargs) = next(iter(changed.specified_callbacks[1].items()))
+    assert path == "sb3_cpm.ChallengerCallback"
+    assert kwargs["preset"] == "report" and kwargs["train_freq"] == 10 and kwargs["unit"] == "step"
+    assert kwargs["decay_kwargs"] == {"start": 0.3, "floor": 0.01, "rate": 1.0}
+    ChallengerCallback(**kwargs)
+    assert of_player["policy_kwargs"] == {"share_features_extractor": False, "net_arch": [64, 64]} | (
+        {"n_quantiles": 5} if algo == "tqc" else {}
+    )
+    assert manager._hyperparams == before and manager.specified_callbacks[1] == {
+        "sb3_cpm.ChallengerCallback": {"preset": "report"}
+    }
+    # and back from the names that the study shows
+    converted = HYPERPARAMS_CONVERTER[algo](dict(trial.params))
+    assert converted.pop(search.OURS).keys() == {*search.BUFFER_SPACE, *search.CALLBACK_SPACE}
+    assert not set(converted) & {*search.BUFFER_SPACE, *search.CALLBACK_SPACE}
+
+
+def test_decays_of_trials_are_possible() -> None:
+    start, floor = (search.CALLBACK_SPACE[name].suggest for name in ("decay_start", "decay_floor"))
+
+    class Highest(FixedTrial):
+        def suggest_float(self, name: str, low: float, high: float, log: bool = False) -> float:
+            return high
+
+    assert floor(Highest(), "floor") <= start(FixedTrial(), "start")
+
+
+def test_a_player_without_challenger_is_searched_as_ever(tmp_path: Path) -> None:
+    manager = manager_of("sac", tmp_path, 10)
+    manager._hyperparams, manager.specified_callbacks = {"policy_kwargs": {}}, []
+    trial = FixedTrial()
+    with search.sampled(manager, trial) as changed:
+        assert changed._hyperparams == {"policy_kwargs": {}} and changed.specified_callbacks == []
+    assert trial.params == {}
+
+
+def test_dreamer_trials_keep_the_preset(tmp_path: Path) -> None:
+    manager = manager_of("dreamer", tmp_path, 10)
+    manager.specified_callbacks = []
+    for preset, deter_size in (({"deter_size": 77}, 77), ("report", 200)):
+        manager._hyperparams = {"preset": preset}
+        with search.sampled(manager, FixedTrial()):
+            found = HYPERPARAMS_SAMPLER["dreamer"](FixedTrial(), 2, 1, {})
+        assert found["preset"]["deter_size"] == deter_size and found["preset"]["horizon"] == 8 and found["train_freq"] == 2
+    trial = FixedTrial()
+    HYPERPARAMS_SAMPLER["plan2explore"](trial, 2, 1, {})
+    assert HYPERPARAMS_CONVERTER["dreamer"](trial.params)["preset"]["gamma"] == 0.9
+
+
+# ---------------------------------------------------------------------- continued runs
+class AtStart(BaseCallback):
+    """What a run begins with."""
+
+    def _on_training_start(self) -> None:
+        callback = next(one for one in self.locals["callback"].callbacks if isinstance(one, ChallengerCallback))
+        assert callback.challenger is not None
+        buffer = callback.buffer
+        self.found = {
+            "step": self.model.num_timesteps,
+            "updates": callback.challenger.trained_updates,
+            "weights": [p.detach().clone() for p in callback.challenger.networks["world_model"].parameters()],
+            "coefficients": state_of(buffer),
+            "proposed": buffer.counters.proposed,
+            "transitions": buffer.n_added,
+            "start": self.model._last_obs["state"].copy(),  # type: ignore[index,union-attr]
+        }
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def state_of(buffer: CPMBuffer) -> bytes:
+    return pickle.dumps(buffer.curator)
+
+
+def train(folder: Path, n_timesteps: int, **kwargs: Any) -> tuple[Any, Any]:
+    changes = {"learning_starts": 100, "batch_size": 8, "gradient_steps": 1, "train_freq": 5}
+    config = str(config_folder() / "cpm_sac.yml")
+    manager = manager_of("sac", folder, n_timesteps, config=config, hyperparams=changes, save_replay_buffer=True, **kwargs)
+    made = manager.setup_experiment()
+    assert made is not None
+    start = AtStart()
+    manager.callbacks.append(start)
+    manager.learn(made[0])
+    manager.save_trained_model(made[0])
+    return made[0], (manager, start)
+
+
+def test_a_continued_run_goes_on_with_everything(tmp_path: Path) -> None:
+    model, (manager, start) = train(tmp_path, 300, save_freq=100, eval_freq=100, n_eval_episodes=1)
+    assert start.found["step"] == start.found["updates"] == 0
+    at_first = start.found["start"]
+    challenger = manager.callbacks[0].challenger
+    first = Path(manager.save_path)
+    assert challenger.trained_updates > 0 and model.replay_buffer.counters.proposed > 0
+    for name in ("challenger.pt", "replay_buffer.pkl", "rl_model_challenger_100_steps.pt", "rl_model_challenger_300_steps.pt"):
+        assert (first / name).is_file(), name
+    assert challenger_file(first / "rl_model_100_steps.zip") == first / "rl_model_challenger_100_steps.pt"
+    assert challenger_file(first / "best_model.zip") == first / "challenger.pt"
+    at_100 = Challenger.load(first / "rl_model_challenger_100_steps.pt", "cpu").trained_updates
+    assert at_100 < challenger.trained_updates
+
+    agent = str(first / f"{TOY}.zip")
+    more, (again, start) = train(tmp_path, 40, trained_agent=agent, eval_freq=20, n_eval_episodes=1)
+    assert start.found["step"] == 300 and more.num_timesteps == 340
+    assert start.found["transitions"] == 300 and start.found["proposed"] == model.replay_buffer.counters.proposed
+    assert start.found["coefficients"] == state_of(model.replay_buffer)
+    assert start.found["updates"] == challenger.trained_updates
+    for was, now in zip(challenger.networks["world_model"].parameters(), start.found["weights"], strict=True):
+        assert th.equal(was, now)
+    # no random warm-up: P was updated in every round
+    assert more.learning_starts == 100 and more._n_updates == model._n_updates + 40 // 5
+    with np.load(Path(again.save_path) / "evaluations.npz") as log:
+        assert log["timesteps"].tolist() == [100, 200, 300, 320, 340] and len(log["results"]) == len(log["successes"]) == 5
+    assert (start.found["start"] != at_first).any(), "the continued run began with the same start state"
+
+
+def test_a_continued_run_without_buffer_and_challenger_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, (manager, _) = train(tmp_path, 120)
+    first = Path(manager.save_path)
+    for name in ("replay_buffer.pkl", "challenger.pt"):
+        (first / name).unlink()
+    model, (_, start) = train(tmp_path, 130, trained_agent=str(first / f"{TOY}.zip"))
+    printed = capsys.readouterr().out
+    assert "there is no challenger.pt" in printed and "there is no replay_buffer.pkl" in printed
+    assert "train with --save-replay-buffer" in printed and "the 100 random steps of learning_starts" in printed
+    assert start.found["step"] == 120 and start.found["transitions"] == 0 and model.num_timesteps == 250
+
+
+def test_what_stops_a_run_does_not_keep_the_challenger_from_being_saved(tmp_path: Path) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 110:
+                raise KeyboardInterrupt
+            return True
+
+    manager = manager_of("sac", tmp_path, 200, config=str(config_folder() / "cpm_sac.yml"))
+    made = manager.setup_experiment()
+    assert made is not None
+    manager.callbacks.append(Stop())
+    manager.learn(made[0])
+    assert made[0].num_timesteps == 110 and (Path(manager.save_path) / "challenger.pt").is_file()
+
+
+# ---------------------------------------------------------------------- our command
+def test_agents_stand_for_algorithm_and_file() -> None:
+    path = str(config_folder() / "cpm_sac.yml")
+    assert complete("train", ["--agent", "cpm_sac", "-n", "5"]) == ["--algo", "sac", "--conf-file", path, "-n", "5"]
+    assert complete("enjoy", ["--agent", "cpm_sac"]) == ["--algo", "sac"]
+    dreamer = str(config_folder() / "dreamer.yml")
+    assert complete("train", ["--algo", "dreamer"]) == ["--algo", "dreamer", "--conf-file", dreamer]
+    assert complete("train", ["--algo", "dreamer", "-conf", "my.yml"]) == ["--algo", "dreamer", "-conf", "my.yml"]
+    assert complete("train", ["--algo", "sac"]) == ["--algo", "sac"]
+
+
+@pytest.fixture
+def _same_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["python -m sb3_cpm.zoo"])
+
+
+@pytest.mark.usefixtures("_same_arguments")
+def test_errors_of_our_command_are_sentences(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0 and "train, enjoy" in capsys.readouterr().out
+    assert main(["trian"]) == 2 and "one of: train" in capsys.readouterr().err
+    assert main(["train", "--agent", "cpm_sak"]) == 1 and "Did you mean 'cpm_sac'" in capsys.readouterr().err
+    assert main(["train", "--agent"]) == 1 and "--agent needs the name" in capsys.readouterr().err
+    assert main(["train", "--agent", "sac", "--env", "CPM/PickCub-v1"]) == 1
+    assert "CPM/PickCube-v1" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------- rl_zoo3's commands, from end to end
+COMMON = ["--device", "cpu", "--eval-episodes", "2", "--save-replay-buffer", "-tb", "tb"]
+RL_ZOO3 = ["-m", "rl_zoo3.{command}", "--gym-packages", "sb3_cpm.zoo"]
+OURS = ["-m", "sb3_cpm.zoo", "{command}"]
+CHAINS = {
+    "cpm_sac": (RL_ZOO3, "sac", TOY, 200, ["learning_starts:100", "batch_size:8"]),
+    "ppo_rgbd": (RL_ZOO3, "ppo", "CPM/PickCube-v1", 100, ["n_envs:1", "n_steps:50", "batch_size:50", "n_epochs:1"]),
+    "dreamer": (OURS, "dreamer", TOY, 200, ["learning_starts:100", "train_freq:50"]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer"])
+def test_train_enjoy_resume_plot(name: str, tmp_path: Path) -> None:
+    program, algo, env_id, n_steps, parameters = CHAINS[name]
+
+    def command(what: str, *arguments: str) -> str:
+        start = [word.format(command=what) for word in program]
+        return run([*start, "--algo", algo, "--env", env_id, "-f", name, *arguments], tmp_path)
+
+    config = ["--conf-file", str(config_folder() / f"{name}.yml"), "-params", *parameters, *COMMON]
+    output = command("train", *config, "-n", str(n_steps), "--eval-freq", str(n_steps // 2), "--seed", "1")
+    assert output.count("Eval num_timesteps") == 2
+    file_name = env_id.replace("/", "-")
+    first, second, other = (tmp_path / name / algo / f"{file_name}_{i}" for i in (1, 2, 3))
+    assert (first / f"{file_name}.zip").is_file() and list(tmp_path.glob("tb/*/*/events*"))
+    assert (first / "challenger.pt").is_file() == name.startswith("cpm")
+
+    output = command("enjoy", "-n", "60", "--no-render")
+    assert "Episode Length 50" in output
+    output = command("enjoy", "-n", "1", "--no-render", "--load-best")
+    assert "best_model" in output
+
+    agent = str(first / f"{file_name}.zip")
+    output = command("train", *config, "-n", "100", "--eval-freq", "50", "--seed", "1", "-i", agent)
+    assert f"Going on at step {n_steps}" in output and "WARNING" not in output
+    with np.load(second / "evaluations.npz") as log:
+        assert log["timesteps"].tolist() == [n_steps // 2, n_steps, n_steps + 50, n_steps + 100]
+    # another seed with as many evaluations, since rl_zoo3 plots the longest runs only
+    command("train", *config, "-n", str(n_steps + 100), "--eval-freq", str((n_steps + 100) // 4), "--seed", "2")
+    assert other.is_dir()
+
+    plots = [
+        "-m",
+        "rl_zoo3.cli",
+        "all_plots",
+        "-a",
+        algo,
+        "-e",
+        file_name,
+        "-f",
+        name,
+        "-l",
+        name,
+        "--no-display",
+        "-o",
+        "curves",
+    ]
+    assert f"|{file_name}|" in run([*plots, "-k", "successes"], tmp_path).replace(" ", "")
+    assert f"|{file_name}|" in run([*plots, "--no-million", "-print"], tmp_path).replace(" ", "")
+    run(["-m", "rl_zoo3.cli", "plot_from_file", "-i", "curves.pkl", "-r", "-iqm", "-l", name], tmp_path)
+
+
+@pytest.mark.slow
+def test_optimize_and_train_with_a_trial(tmp_path: Path) -> None:
+    config = str(config_folder() / "cpm_sac.yml")
+    start = ["-m", "rl_zoo3.train", "--gym-packages", "sb3_cpm.zoo", "--algo", "sac", "--env", TOY, "--conf-file", config]
+    start += ["-f", "logs", "--device", "cpu", "--storage", "study.log", "--study-name", "s", "-params", "learning_starts:100"]
+    searching = [
+        "-n",
+        "130",
+        "-optimize",
+        "--n-trials",
+        "2",
+        "--n-evaluations",
+        "1",
+        "--eval-episodes",
+        "1",
+        "--no-optim-plots",
+    ]
+    output = run([*start, *searching, "--sampler", "random", "--seed", "3"], tmp_path)
+    assert "Number of finished trials:  2" in output
+    report = next((tmp_path / "logs" / "sac").glob("report_*.csv")).read_text()
+    assert report.count("COMPLETE") == 2
+    assert all(f"params_{name}" in report for name in (*search.BUFFER_SPACE, *search.CALLBACK_SPACE, "net_arch"))
+    run([*start, "-n", "110", "--eval-freq", "-1", "--trial-id", "1"], tmp_path)
+    saved = next((tmp_path / "logs" / "sac").glob(f"{TOY}_*/{TOY}/config.yml")).read_text()
+    values = dict(yaml.unsafe_load(saved))
+    assert search.OURS not in values and {"challenge_ratio", "mix"} <= set(values["replay_buffer_kwargs"])
+    assert "decay" in values["callback"][0]["sb3_cpm.ChallengerCallback"]
