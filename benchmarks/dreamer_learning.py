@@ -37,8 +37,8 @@ EPISODES = 10
 TRAIN_FREQ, LEARNING_STARTS = 5, 1000
 NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
 TASKS: dict[str, dict[str, Any]] = {
-    "pendulum": dict(id="Pendulum-v1", steps=10_000, every=1000, solved=-200),
-    "pendulum_pixels": dict(id="pixels:PendulumPixels-v0", steps=10_000, every=1000, solved=-200),
+    "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, solved=-200),
+    "pendulum_pixels": dict(id="pixels:PendulumPixels-v0", steps=8000, every=1000, solved=-200),
 }
 
 
