@@ -24,13 +24,13 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from learning_curves import Table, curves, draw, interval, read
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cpm.dreamer import Plan2Explore
 
 FOLDER = Path(__file__).parents[1] / "results" / "coverage"
 NAMES = {"plan2explore": "Plan2Explore", "rnd": "RND", "random": "random actions"}
-LEARNING_STARTS = 500
+LEARNING_STARTS, TRAIN_FREQ = 500, 10
 RECORD_EVERY = 250
 
 
@@ -97,10 +97,10 @@ class Unrewarded(gym.Wrapper):
 def run(agent: str, name: str, seed: int, path: Path) -> None:
     task, start = TASKS[name], time.process_time()
     inner = Unrewarded(task)
-    env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(inner, task.episode)])
+    env = VecNormalize(DummyVecEnv([lambda: gym.wrappers.TimeLimit(inner, task.episode)]), norm_reward=False)
     model = Plan2Explore(
         "MlpPolicy", env, seed=seed, device="cpu",
-        learning_starts=task.steps if agent == "random" else LEARNING_STARTS,
+        learning_starts=task.steps if agent == "random" else LEARNING_STARTS, train_freq=TRAIN_FREQ,
         uncertainty_class="plan2explore" if agent == "random" else agent,
     )  # fmt: skip
     model.learn(task.steps, log_interval=None)

@@ -451,7 +451,6 @@ def test_learning_offline_from_an_explorers_buffer(tmp_path):
     with pytest.warns(UserWarning, match="truncated"):
         model.load_replay_buffer(tmp_path / "buffer")
     before = part(model.challenger, "task").detach().clone()
-    model.set_logger(configure(None, []))
     model.train(3)
     assert model._n_updates == 3 and not th.equal(part(model.challenger, "task"), before)
 

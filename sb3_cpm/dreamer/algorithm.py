@@ -22,6 +22,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import configure_logger
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import check_environment
@@ -227,6 +228,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         assert isinstance(buffer, EpisodeBuffer)
         if not buffer.episodes_ended:
             return
+        if not hasattr(self, "_logger"):  # offline, before any learn()
+            self._logger = configure_logger(verbose=0)
         self.policy.set_training_mode(True)
         self._adapt_learning_rates()
         for _ in range(gradient_steps):
