@@ -16,7 +16,7 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_cpm.__main__ import main
-from sb3_cpm.experiments import EXPERIMENTS, draw, find_experiment, run_experiment, summary_table
+from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_experiment, run_experiment, summary_table
 from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
 from sb3_cpm.experiments.collect import collect
@@ -139,6 +139,19 @@ def test_hindsight_agent_resumes_too(tmp_path, monkeypatch):
     assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
 
 
+def test_dreamer_resumes_too(tmp_path, monkeypatch):
+    small = {"batch_size": 2, "sequence_length": 8, "imagination_starts": 4}
+    wanted = ("policy", "learning_starts", "buffer_size", "env_kwargs")
+    dreamer = {**{key: TINY[key] for key in wanted}, "train_freq": 20, "preset": small}
+    spec = replace(make_spec("dreamer"), overrides=dreamer)
+    unbroken = perform(spec, tmp_path / "unbroken")
+    revive = kill_at(monkeypatch, 190)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path / "broken")
+    revive()
+    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+
+
 def test_on_policy_agent_resumes_too(tmp_path, monkeypatch):
     ppo = {
         "policy": "MultiInputPolicy",
@@ -243,7 +256,8 @@ def test_evaluation_seeds_every_episode():
     evaluate(built.model, env, 1)
     env.seed(FIRST_SEED)
     assert np.array_equal(env.reset()["state"], start)
-    env.close(), built.env.close()
+    env.close()
+    built.env.close()
 
 
 # ---------------------------------------------------------------------- many runs
@@ -288,6 +302,20 @@ def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
     data = collect(tiny_experiment, tmp_path)
     assert any("left out" in note and "CPM/toy/seed1" in note for note in data.notes)
     assert data.tables["evaluations"].groupby("agent")["seed"].nunique().to_dict() == {"CPM": 1, "SAC": 2}
+
+
+def test_figures_of_another_experiments_runs(tmp_path, tiny_experiment):
+    assert ensure_data("tiny", tmp_path, seeds=1) is True
+    assert draw("tiny", tmp_path, quick=True).axes
+    figure = draw("8", tmp_path, source="tiny", quick=True, task="toy")
+    epsilon = next(axes for axes in figure.axes if axes.get_title(loc="left").startswith("epsilon"))
+    assert [line.get_label() for line in epsilon.lines] == ["CPM (1 seed)"]
+    values = epsilon.lines[0].get_ydata()
+    assert 0 < values[-1] < values[0] < 1
+    with pytest.raises(ValueError, match="no data for 'tiny' on 'toi'"):
+        draw("8", tmp_path, source="tiny", quick=True, task="toi")
+    shutil.move(tmp_path / "tiny-quick", tmp_path / "tiny")
+    assert ensure_data("tiny", tmp_path) is False
 
 
 def test_a_crashed_run_is_recorded_and_the_others_go_on(tmp_path, tiny_experiment):

@@ -7,7 +7,7 @@ The experiments of the report: runs as data, results as tidy CSV, figures from t
 """
 
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
-from sb3_cpm.experiments.reports import draw, listing, reproduce, run_experiment, summary_table
+from sb3_cpm.experiments.reports import draw, ensure_data, listing, reproduce, run_experiment, summary_table
 from sb3_cpm.experiments.single_run import RunResult
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 
@@ -20,6 +20,7 @@ __all__ = [
     "RunSpec",
     "Task",
     "draw",
+    "ensure_data",
     "find_experiment",
     "listing",
     "reproduce",

@@ -13,6 +13,10 @@ from sb3_cpm.experiments.specification import Experiment
 IDENTITY = ["agent", "env", "seed"]
 
 
+class NoDataError(ValueError):
+    """There is nothing to draw."""
+
+
 @dataclass(frozen=True)
 class Data:
     """
@@ -26,7 +30,7 @@ class Data:
     notes: list[str]
 
 
-def collect(experiment: Experiment, results: str | Path, quick: bool = False) -> Data:
+def collect(experiment: Experiment, results: str | Path, quick: bool = False, task: str | None = None) -> Data:
     """
     Read all runs of an experiment.
 
@@ -36,16 +40,19 @@ def collect(experiment: Experiment, results: str | Path, quick: bool = False) ->
     :param experiment: whose contenders and tasks are looked for
     :param results: folder of all results
     :param quick: the quick version
+    :param task: only the runs on this one
     :return: the tables
     :raises ValueError: where there is no data, with the command that makes it
     """
     root = Path(results) / experiment.folder_name(quick)
     agents = [contender.name for contender in experiment.contenders]
-    folders = [path.parent for path in sorted(root.glob(f"*/*/seed*/{CONFIG}")) if path.parent.parent.parent.name in agents]
+    found = [path.parent for path in sorted(root.glob(f"*/{task or '*'}/seed*/{CONFIG}"))]
+    folders = [folder for folder in found if folder.parts[-3] in agents]
     if not folders:
+        of_task = f" on {task!r}" if task else ""
         flags = (" --quick" if quick else "") + ("" if str(results) == "results" else f" --results {results}")
-        raise ValueError(
-            f"There is no data for {experiment.name!r} in {root}: make it with "
+        raise NoDataError(
+            f"There is no data for {experiment.name!r}{of_task} in {root}: make it with "
             f"`python -m sb3_cpm reproduce --figure {experiment.name}{flags}`."
         )
     configs = {folder: read_yaml(folder / CONFIG) for folder in folders}
@@ -57,7 +64,7 @@ def collect(experiment: Experiment, results: str | Path, quick: bool = False) ->
         notes.append(f"not finished yet: {', '.join(unfinished)}")
     tables = {name: _read_all(kept, name) for name in ("evaluations", "training", "diagnostics")}
     if tables["evaluations"].empty:
-        raise ValueError(f"No run in {root} has been evaluated yet.")
+        raise NoDataError(f"No run in {root} has been evaluated yet.")
     return Data(tables, notes)
 
 

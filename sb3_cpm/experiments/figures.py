@@ -93,21 +93,36 @@ PANELS: dict[str, tuple[Panel, ...]] = {
 }
 
 
-def draw_experiment(experiment: Experiment, results: str | Path, quick: bool = False) -> tuple[Figure, list[str]]:
+def draw_experiment(
+    experiment: Experiment,
+    results: str | Path,
+    quick: bool = False,
+    source: Experiment | None = None,
+    task: str | None = None,
+) -> tuple[Figure, list[str]]:
     """
     :param experiment: what is drawn
     :param results: folder of all results
     :param quick: the quick version
+    :param source: another experiment whose runs are drawn in the same way
+    :param task: only the runs on this one
     :return: the figure, and notes about its data
     :raises ValueError: where there is no data, with the command that makes it
     """
-    data = collect(experiment, results, quick)
+    drawing, title, experiment = experiment.drawing, _title(experiment, quick, source, task), source or experiment
+    data = collect(experiment, results, quick, task)
     with plt.rc_context(STYLE):
-        figure = DRAWINGS[experiment.drawing](experiment, data)
-        number = f"Figure {experiment.figure}: " if experiment.figure else ""
-        version = f" (quick version, on {', '.join(task.name for task in experiment.quick.tasks)})" if quick else ""
-        figure.suptitle(f"{number}{experiment.title}{version}", fontweight="bold")
+        figure = DRAWINGS[drawing](experiment, data)
+        figure.suptitle(title, fontweight="bold")
     return figure, data.notes
+
+
+def _title(experiment: Experiment, quick: bool, source: Experiment | None, task: str | None) -> str:
+    number = f"Figure {experiment.figure}: " if experiment.figure else ""
+    version = f" (quick version, on {', '.join(task.name for task in experiment.quick.tasks)})" if quick else ""
+    if source is not None:
+        version = f"\nruns of {source.name}" + (f", {task}" if task else "")
+    return f"{number}{experiment.title}{version}"
 
 
 def _agents(experiment: Experiment, table: pd.DataFrame) -> list[str]:
@@ -190,6 +205,9 @@ def _draw_training(experiment: Experiment, data: Data) -> Figure:
 
 def _draw_panels(panels: Sequence[Panel], experiment: Experiment, data: Data) -> Figure:
     table = data.tables["diagnostics"]
+    tasks = sorted(set(table["env"]))
+    if len(tasks) > 1:
+        raise ValueError(f"Logged numbers are drawn of one task: choose task= one of {', '.join(map(repr, tasks))}.")
     columns = min(3, len(panels))
     figure, grid = _grid(-(-len(panels) // columns), columns)
     for axes, panel in zip(grid.flat, panels, strict=False):

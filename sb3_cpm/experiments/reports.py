@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
-from sb3_cpm.experiments.collect import collect
+from sb3_cpm.experiments.collect import NoDataError, collect
 from sb3_cpm.experiments.grid import perform_all
 from sb3_cpm.experiments.single_run import RunResult
 from sb3_cpm.experiments.specification import Experiment
@@ -52,35 +52,77 @@ def run_experiment(
     return perform_all(specs, Path(results), jobs, tell, device)
 
 
-def draw(name: str, results: str | Path = RESULTS, quick: bool = False) -> "Figure":
+def ensure_data(
+    name: str,
+    results: str | Path = RESULTS,
+    seeds: int | None = None,
+    steps: int | None = None,
+    jobs: int = 0,
+    tell: Callable[[str], None] = print,
+) -> bool:
+    """
+    Make sure that there is something to draw: for notebooks.
+
+    :param name: of an experiment, or a figure's number
+    :param results: folder of all results
+    :param seeds: of the quick version, where it has to be run
+    :param steps: likewise
+    :param jobs: likewise; 0: in this process
+    :param tell: is given lines about the progress
+    :return: ``quick`` for :func:`draw`: False where there are results of the full version, else True, and the quick version
+        has been run as far as it was missing
+    :raises RuntimeError: if one of its runs crashed or was refused
+    """
+    try:
+        collect(find_experiment(name), results)
+        return False
+    except NoDataError:
+        pass
+    for outcome in run_experiment(name, True, results, seeds, jobs, tell, steps):
+        if outcome.outcome in ("crashed", "refused"):
+            raise RuntimeError(f"{outcome.spec.name} {outcome.outcome}: {outcome.message}")
+    return True
+
+
+def draw(
+    name: str,
+    results: str | Path = RESULTS,
+    quick: bool = False,
+    source: str | None = None,
+    task: str | None = None,
+) -> "Figure":
     """
     :param name: of an experiment, or a figure's number
     :param results: folder of all results
     :param quick: draw the quick version
+    :param source: name of another experiment whose runs are drawn in this figure's way
+    :param task: only the runs on this one; for the figures of logged numbers where an experiment has several
     :return: the figure, from the CSV files alone
     :raises ValueError: where there is no data, with the command that makes it
     """
     from sb3_cpm.experiments.figures import draw_experiment
 
-    figure, notes = draw_experiment(find_experiment(name), results, quick)
+    other = None if source is None else find_experiment(source)
+    figure, notes = draw_experiment(find_experiment(name), results, quick, other, task)
     if notes:
         figure.supxlabel("Note: " + "; ".join(notes), fontsize=7, wrap=True)
     return figure
 
 
-def summary_table(name: str, results: str | Path = RESULTS, quick: bool = False) -> pd.DataFrame:
+def summary_table(name: str, results: str | Path = RESULTS, quick: bool = False, task: str | None = None) -> pd.DataFrame:
     """
     The last evaluation that all seeds have, in numbers.
 
     :param name: of an experiment, or a figure's number
     :param results: folder of all results
     :param quick: the quick version
+    :param task: only this one
     :return: a row per task and agent: seeds, step, and per score the interquartile mean with its 95% interval as text;
         ``to_markdown()`` makes text of it
     :raises ValueError: where there is no data, with the command that makes it
     """
     experiment = find_experiment(name)
-    table = collect(experiment, results, quick).tables["evaluations"]
+    table = collect(experiment, results, quick, task).tables["evaluations"]
     rows = []
     for task in dict.fromkeys(table["env"]):
         for contender in experiment.contenders:
