@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from sb3_cpm.envs import clouds
 from sb3_cpm.envs import observations as obs_tools
+from sb3_cpm.envs.companions import follow
 from sb3_cpm.envs.start_states import StartState, restore, state_of
 from sb3_cpm.envs.thrift import save_work
 from sb3_cpm.envs.visuals import Visuals
@@ -149,6 +150,7 @@ class ManiSkillBatch:
         actions = np.asarray(actions, dtype=np.float32)
         if not np.isfinite(actions).all():
             raise ValueError(f"Actions must be finite numbers within [-1, 1], got {actions}.")
+        follow()
         raw, reward, terminated, _, info = self.env.step(actions)
         host = obs_tools.to_host({**self._select(raw, info), "reward": reward, "terminated": terminated})
         steps = host["info"]["elapsed_steps"]

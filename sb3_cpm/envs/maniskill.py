@@ -17,6 +17,7 @@ from gymnasium.utils import seeding
 from sb3_cpm.envs.batch import OBS_MODES, ManiSkillBatch
 from sb3_cpm.envs.clouds import CloudSettings
 from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, choose_renderer, explained
+from sb3_cpm.envs.rendering import opened
 from sb3_cpm.envs.simulation import choose_simulation
 from sb3_cpm.envs.start_states import StartState, check_state
 from sb3_cpm.envs.visuals import choose_visuals
@@ -253,7 +254,7 @@ def build_batch(
         num_envs, sim_backend, task_kwargs, renderer.backend, obs_mode == "visual"
     )
     context = choose_visuals(visuals, software=renderer.software)
-    with explained(env_id), context:
+    with explained(env_id), context, opened(renderer):
         env = gym.make(
             task.env_id,
             disable_env_checker=True,

@@ -22,10 +22,12 @@ import sys
 import tempfile
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_cpm.envs import vulkan, vulkan_install
+from sb3_cpm.envs.companions import companions
 
 SOFTWARE = ("llvmpipe", "swiftshader")
 """Parts of the device names of renderers that run on the CPU."""
@@ -90,6 +92,25 @@ def ensure_renderer() -> Renderer:
         if _renderer.software:
             use_fast_shaders()
     return _renderer
+
+
+@contextlib.contextmanager
+def opened(renderer: Renderer) -> Iterator[None]:
+    """
+    Build scenes within this context: their renderer's thread is known then, and stays near (:mod:`sb3_cpm.envs.companions`).
+
+    :param renderer: this process's
+    """
+    # a renderer that was told to share its work among several threads needs several cores
+    if not renderer.software or os.environ.get("LP_NUM_THREADS") != "0":
+        yield
+        return
+    import sapien
+
+    with companions():
+        system = sapien.render.RenderSystem(sapien.Device("cpu"))
+    yield  # all of a process's scenes share one Vulkan device, which lives as long as one of them does
+    del system
 
 
 class _NoMaterial:
