@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_cpm.experiments.run_folder import OtherResultError, write_crashed
+from sb3_cpm.experiments.run_folder import LockedError, OtherResultError, write_crashed
 from sb3_cpm.experiments.single_run import RunResult, perform
 from sb3_cpm.experiments.specification import RunSpec
 
@@ -48,12 +48,8 @@ def attempt(spec: RunSpec, results: Path, tell: Tell = print, device: str = "cpu
     folder = spec.folder(results)
     try:
         return perform(spec, results, tell, device)
-    except OtherResultError as error:
+    except (OtherResultError, LockedError) as error:
         return RunResult(spec, "refused", str(error), folder)
-    except RuntimeError as error:
-        if "is being written by another process" in str(error):
-            return RunResult(spec, "refused", str(error), folder)
-        return _crashed(spec, folder, traceback.format_exc(), error)
     except Exception as error:
         return _crashed(spec, folder, traceback.format_exc(), error)
 

@@ -15,7 +15,6 @@ The folder of one run: who may write there, and what its state is.
 import contextlib
 import fcntl
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,10 @@ CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
 
 class OtherResultError(ValueError):
     """A folder holds something else than what is asked for."""
+
+
+class LockedError(RuntimeError):
+    """Another process is writing a folder."""
 
 
 def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
@@ -58,26 +61,21 @@ def locked(folder: Path) -> Iterator[None]:
     """
     Let nobody else write this folder; the lock goes with the process, however that ends.
 
-    :raises RuntimeError: while another process holds it
+    :raises LockedError: while another process holds it
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / ".lock"
-    with path.open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            raise RuntimeError(
-                f"{folder} is being written by another process ({file.read().strip() or 'unknown'}). Wait for it, or choose "
-                "another folder with --results."
-            ) from error
-        file.truncate(0)
-        file.write(f"pid {os.getpid()} since {time.strftime('%F %T')}")
-        file.flush()
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)  # the folder itself: a lock file would have to be removed, which is a race
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        raise LockedError(
+            f"{folder} is being written by another process. Wait for it, or choose another folder with --results."
+        ) from error
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     :param results: folder of all results
     :param tell: is given a line now and then
     :param device: PyTorch device; small networks are fastest on the CPU
-    :raises RuntimeError: while another process makes the same run
+    :raises LockedError: while another process makes the same run
     :raises ValueError: for an unknown agent or environment, for wrong hyperparameters, and if the folder holds a run with
         other ones
     """
