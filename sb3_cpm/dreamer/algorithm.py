@@ -56,6 +56,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self,
         policy: str | type[DreamerPolicy],
         env: GymEnv | str,
+        *,
         learning_rate: float | Schedule | None,
         buffer_size: int,
         learning_starts: int,
