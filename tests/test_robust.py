@@ -1,9 +1,13 @@
 """Worker processes that die, hang or grow: the training goes on."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,6 +23,9 @@ import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
+from sb3_cpm.run import TrainSettings, train
+
+ROOT = Path(__file__).parents[1]
 
 
 class Mortal(gym.Wrapper):
@@ -209,3 +216,74 @@ def test_make_vec_env_of_sb3_makes_it() -> None:
     assert env.env_is_wrapped(Monitor) == [True, True] and env.reset()["state"].shape == (2, 4)  # type: ignore
     env.close()
     env.close()  # once more does no harm
+
+
+# ---------------------------------------------------------------------- in a training run
+SMALL: dict[str, Any] = {
+    "env": "CPMToy-v0",
+    "n_envs": 2,
+    "learning_starts": 100,
+    "batch_size": 16,
+    "train_freq": 10,
+    "evaluations": 0,
+    "video": False,
+    "progress_bar": False,
+    "callback_kwargs": {"challenger_kwargs": {"batch_size": 4, "sequence_length": 16, "imagination_starts": 8, "horizon": 5}},
+}
+
+
+class KillsAt(BaseCallback):
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+        self.restarts: list[int] = []
+
+    def _on_step(self) -> bool:
+        env: Any = self.training_env.unwrapped
+        if self.num_timesteps == self.step:
+            env.workers[1].process.kill()
+        self.restarts = env.restarts
+        return True
+
+
+def test_a_training_run_goes_on_without_a_worker_that_died(tmp_path: Path) -> None:
+    killer = KillsAt(130)
+    with pytest.warns(UserWarning, match=r"Worker 1 died with exit code -9"):
+        summary = train(TrainSettings(steps=300, run_folder=str(tmp_path / "run"), **SMALL), callback=killer)
+    assert killer.restarts == [0, 1]
+    assert summary.steps == 300 and summary.outcome == "finished"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="groups of processes")
+def test_ctrl_c_in_a_training_run_with_workers(tmp_path: Path) -> None:
+    """A terminal sends it to all processes at once: the workers wait for the end, nobody takes their silence for a death."""
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from sb3_cpm.run import TrainSettings, train\n"
+        "if __name__ == '__main__': train(TrainSettings(steps=100_000, run_folder=sys.argv[1], **eval(sys.argv[2])))\n"
+    )
+    (tmp_path / "run.py").write_text(code)
+    folder = tmp_path / "run"
+    child = subprocess.Popen(
+        [sys.executable, str(tmp_path / "run.py"), str(folder), repr(SMALL)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+    )
+    deadline = time.monotonic() + 120
+    while not ((folder / "episodes.csv").exists() and len((folder / "episodes.csv").read_text().splitlines()) > 3):
+        assert child.poll() is None and time.monotonic() < deadline
+        time.sleep(0.2)
+    os.killpg(child.pid, signal.SIGINT)
+    _, errors = child.communicate(timeout=60)
+    assert "KeyboardInterrupt" in errors and "died" not in errors and "Process ForkServer" not in errors, errors
+    assert json.loads((folder / "summary.json").read_text())["outcome"] == "stopped by Ctrl-C"
+    for _ in range(50):
+        try:
+            os.killpg(child.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("some of its processes are still there")

@@ -8,9 +8,10 @@ import gymnasium as gym
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm.envs.robust import RobustSubprocVecEnv
 from sb3_cpm.envs.wrappers import DictObservation
 
 
@@ -41,7 +42,8 @@ def make_env(env_id: str, render_mode: str | None = None, **kwargs: Any) -> gym.
 
 def make_vec_env(env_id: str, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
     """
-    Environments for training, each with a ``Monitor``; more than one run in processes of their own.
+    Environments for training, each with a ``Monitor``; more than one run in processes of their own. One that dies is replaced,
+    its episode truncated: a simulator's crash after days costs an episode and not the run.
 
     :param env_id: see :func:`make_env`
     :param n_envs: how many
@@ -61,7 +63,7 @@ def make_vec_env(env_id: str, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
         return make
 
     makers = [maker(rank) for rank in range(n_envs)]
-    env: VecEnv = DummyVecEnv(makers) if n_envs == 1 else SubprocVecEnv(makers)
+    env: VecEnv = DummyVecEnv(makers) if n_envs == 1 else RobustSubprocVecEnv(makers)
     env.seed(seed)
     return env
 
