@@ -46,12 +46,11 @@ def known(env_id: str) -> bool:
 
 
 # ---------------------------------------------------------------------- ids and names
-def test_tasks_are_registered_without_importing_maniskill() -> None:
+def test_tasks_are_registered_without_importing_maniskill(tmp_path: Path) -> None:
     assert len(ENV_IDS) == 2 * len(TASKS) == 14 and all(env_id in gym.registry for env_id in ENV_IDS)
     assert env_id_of("TurnFaucet-v1", state=True) == "CPM/TurnFaucetState-v1"
     script = "import sys, sb3_cpm.zoo; print([name for name in ('mani_skill', 'sapien') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True)
-    assert done.stdout.strip() == "[]"
+    assert run(["-c", script], tmp_path).strip() == "[]"
 
 
 def test_rl_zoo3_knows_our_names() -> None:
