@@ -45,11 +45,24 @@ CAMERAS = ("base_camera", "hand_camera")
         ("PickCube-v1", {"render_mode": "human"}, "render_mode"),
         ("PickCube-v1", {"render_size": 0}, "render_size"),
         ("PickCube-v1", {"cameras": ["front"]}, "base_camera, hand_camera"),
+        ("PickCube-v1", {"cameras": "front"}, "Unknown camera 'front'"),
+        ("PickCube-v1", {"num_envs": 4}, "make_maniskill_vec_env"),
+        ("PickCube-v1", {"sim_backend": "physx_cuda"}, "make_maniskill_vec_env"),
     ],
 )
 def test_bad_requests_are_value_errors_with_the_cure(env_id: str, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_maniskill_env(env_id, **kwargs)
+
+
+@pytest.mark.maniskill
+def test_an_action_of_a_wrong_size_and_cameras_by_name() -> None:
+    env = make_maniskill_env("PickCube-v1", cameras="hand_camera", image_size=16)
+    assert env.batch.cameras == ("hand_camera",)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"actions of shape \(7,\), got \(6,\)"):
+        env.step(np.zeros(6))
+    env.close()
 
 
 MISSING_ASSETS = """

@@ -56,7 +56,7 @@ class ManiSkillBatch:
     def __init__(
         self,
         env: Any,
-        cameras: Sequence[str] | None,
+        cameras: Sequence[str] | str | None,
         obs_mode: str,
         cloud: clouds.CloudSettings,
         max_episode_steps: int,
@@ -145,9 +145,11 @@ class ManiSkillBatch:
     def step(self, actions: np.ndarray) -> BatchStep:
         """
         :param actions: shape ``(N, action_dim)``
-        :raises ValueError: for actions that are not finite: they would ruin the simulation for good
+        :raises ValueError: for actions of a wrong size, or that are not finite: they would ruin the simulation for good
         """
         actions = np.asarray(actions, dtype=np.float32)
+        if actions.shape != (self.num_envs, *self.action_space.shape):
+            raise ValueError(f"Expected actions of shape {self.action_space.shape}, got {actions.shape[1:]}.")
         if not np.isfinite(actions).all():
             raise ValueError(f"Actions must be finite numbers within [-1, 1], got {actions}.")
         follow()
@@ -257,8 +259,10 @@ class ManiSkillBatch:
         return infos
 
     # ------------------------------------------------------------------ scene
-    def _choose_cameras(self, wanted: Sequence[str] | None) -> tuple[str, ...]:
+    def _choose_cameras(self, wanted: Sequence[str] | str | None) -> tuple[str, ...]:
         available = tuple(self.env._sensors)
+        if wanted is not None:
+            wanted = (wanted,) if isinstance(wanted, str) else tuple(dict.fromkeys(wanted))  # each once
         unknown = [name for name in wanted or () if name not in available]
         if unknown:
             raise ValueError(f"Unknown camera {unknown[0]!r}: this task with this robot has {', '.join(available) or 'none'}.")

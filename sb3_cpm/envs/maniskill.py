@@ -127,7 +127,7 @@ def make_maniskill_env(
     control_mode: str = "pd_ee_delta_pose",
     reward_mode: str = "normalized_dense",
     robot_uids: str | None = None,
-    cameras: Sequence[str] | None = None,
+    cameras: Sequence[str] | str | None = None,
     image_size: int | tuple[int, int] = 32,
     n_points: int = 256,
     goal_points: int = 50,
@@ -185,6 +185,9 @@ def make_maniskill_env(
     :raises ValueError: for an unknown task, robot, controller, camera, mode, or an impossible size
     :raises RuntimeError: if assets are missing or this machine cannot render, with the cure
     """
+    for name in ("num_envs", "sim_backend"):
+        if name in task_kwargs:
+            raise ValueError(f"make_maniskill_env makes one environment on the CPU; {name} is for make_maniskill_vec_env.")
     return ManiSkillEnv(
         build_batch(
             env_id,
@@ -221,7 +224,7 @@ def build_batch(
     control_mode: str,
     reward_mode: str,
     robot_uids: str | None,
-    cameras: Sequence[str] | None,
+    cameras: Sequence[str] | str | None,
     image_size: int | tuple[int, int],
     n_points: int,
     goal_points: int,
