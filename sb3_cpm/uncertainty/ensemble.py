@@ -11,9 +11,8 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
+from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.linear import affine, is_faster
-
-SLICE = 64  # rows of all heads that are worked on at once
 
 
 class Ensemble(nn.Module):
@@ -94,8 +93,8 @@ class _Disagreement(torch.autograd.Function):
     def forward(ctx: Any, *predictions: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(*predictions)
         dim = predictions[0].shape[-1]
-        slices = zip(*(_slices(one.view(-1, dim)) for one in predictions), strict=True)
-        result = torch.cat([root(_spread(parts)[2]).mean(-1) for parts in slices])
+        slices = cache_slices(*(one.view(-1, dim) for one in predictions))
+        result = torch.cat([root(_spread(parts)[1]).mean(-1) for parts in slices])
         return result.view(predictions[0].shape[:-1])
 
     @staticmethod
@@ -104,18 +103,17 @@ class _Disagreement(torch.autograd.Function):
         predictions = ctx.saved_tensors
         dim = predictions[0].shape[-1]
         results = [torch.empty_like(one) for one in predictions]
-        flat, found = ([_slices(one.view(-1, dim)) for one in many] for many in (predictions, results))
-        scale = _slices(gradient.reshape(-1, 1) / (len(predictions) * dim))
-        for i, weight in enumerate(scale):
-            _, differences, variance = _spread([parts[i] for parts in flat])
+        scale = gradient.reshape(-1, 1) / (len(predictions) * dim)
+        for weight, *parts in cache_slices(scale, *(one.view(-1, dim) for one in (*predictions, *results))):
+            differences, variance = _spread(parts[: len(predictions)])
             slope = weight / (variance + EPSILON**2).sqrt_()
-            for difference, parts in zip(differences, found, strict=True):
-                torch.mul(difference, slope, out=parts[i])
+            for difference, out in zip(differences, parts[len(predictions) :], strict=True):
+                torch.mul(difference, slope, out=out)
         return tuple(results)
 
 
-def _spread(predictions: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor], torch.Tensor]:
-    """Mean over the heads, their differences from it, and the variance."""
+def _spread(predictions: Sequence[torch.Tensor]) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """The heads' differences from their mean, and the variance."""
     mean = predictions[0] + predictions[1]
     for one in predictions[2:]:
         mean += one
@@ -124,12 +122,7 @@ def _spread(predictions: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[tor
     variance = differences[0].square()
     for one in differences[1:]:
         variance.addcmul_(one, one)
-    return mean, differences, variance.div_(len(predictions))
-
-
-def _slices(rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """On a CPU so many rows that those of all heads fit into its caches; on a GPU all."""
-    return rows.split(SLICE) if rows.device.type == "cpu" else (rows,)
+    return differences, variance.div_(len(predictions))
 
 
 def ensemble_loss(predictions: Sequence[torch.Tensor] | torch.Tensor, targets: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ Acting and judging episodes stay in float32 as well; they cost little, and their
 import contextlib
 import functools
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 
 import torch
@@ -25,6 +25,17 @@ def mixed_precision(device: torch.device, enabled: bool) -> AbstractContextManag
     :param enabled: False for a context that does nothing
     """
     return torch.autocast(device.type, dtype=torch.bfloat16) if enabled else contextlib.nullcontext()
+
+
+def cache_slices(*tensors: torch.Tensor, rows: int = 64) -> Iterator[tuple[torch.Tensor, ...]]:
+    """
+    The same rows of all tensors, on a CPU so few that several operations on them stay in its caches; on a GPU all at once.
+
+    :param tensors: of equal first dimension
+    :param rows: of a slice
+    """
+    size = rows if tensors[0].device.type == "cpu" else max(len(tensors[0]), 1)
+    return zip(*(one.split(size) for one in tensors), strict=True)
 
 
 def check_mixed_precision(device: torch.device) -> None:

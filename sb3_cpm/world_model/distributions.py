@@ -42,6 +42,15 @@ class GaussianLatent:
         mean, std = self.mean_std(stats)
         return torch.addcmul(mean, std, noise)
 
+    def slopes(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """What :meth:`pull_back` needs to know of samples, for any batch dimensions at once."""
+        sigmoid = torch.sigmoid(0.5 * stats[..., self.size :])
+        return noise * sigmoid * (1.0 - sigmoid)
+
+    def pull_back(self, slopes: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """Gradient of samples to gradient of ``stats``, by hand."""
+        return torch.cat((gradient, gradient * slopes), dim=-1)
+
     def mode(self, stats: torch.Tensor) -> torch.Tensor:
         return stats[..., : self.size]
 
@@ -89,6 +98,15 @@ class CategoricalLatent:
         quantiles = probabilities.detach().cumsum(-1)
         chosen = torch.searchsorted(quantiles, noise.unsqueeze(-1), right=True).clamp_(max=self.classes - 1)
         return _StraightThrough.apply(probabilities, chosen).flatten(-2)
+
+    def slopes(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """See :meth:`GaussianLatent.slopes`."""
+        return F.softmax(self._logits(stats), dim=-1)
+
+    def pull_back(self, slopes: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """See :meth:`GaussianLatent.pull_back`."""
+        weighted = slopes * self._logits(gradient)
+        return torch.addcmul(weighted, slopes, weighted.sum(-1, keepdim=True), value=-1.0).flatten(-2)
 
     def mode(self, stats: torch.Tensor) -> torch.Tensor:
         return F.one_hot(self._logits(stats).argmax(-1), self.classes).to(stats.dtype).flatten(-2)

@@ -1,8 +1,11 @@
 """The losses of Dreamer as pure functions (Hafner et al. 2021, eq. 2, 4 and 5)."""
 
-import torch
-import torch.nn.functional as F
+from typing import Any
 
+import torch
+from torch.autograd.function import once_differentiable
+
+from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.distributions import Latent
 
 
@@ -19,9 +22,34 @@ def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
 
 
 def squared_error(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Negative log-likelihood of a unit-variance Gaussian without its constant, summed over all but the first dimension."""
-    error = F.mse_loss(prediction, target, reduction="none")  # one pass over the images, forwards and backwards
-    return 0.5 * (error.sum(tuple(range(1, error.dim()))) if error.dim() > 1 else error)
+    """
+    Negative log-likelihood of a unit-variance Gaussian without its constant, summed over all but the first dimension.
+
+    :param prediction: shape ``(n, *dims)``
+    :param target: shape ``(n, *dims)``, without gradient
+    """
+    return _SquaredError.apply(prediction, target)
+
+
+class _SquaredError(torch.autograd.Function):
+    """:func:`squared_error` by hand: images are read and written in slices that fit into the cache, not once per operation."""
+
+    @staticmethod
+    def forward(ctx: Any, prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(prediction, target)
+        dims = tuple(range(1, prediction.dim()))
+        squares = [(one - other).square_() for one, other in cache_slices(prediction, target)]
+        return 0.5 * torch.cat([one.sum(dims) if dims else one for one in squares])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        prediction, target = ctx.saved_tensors
+        result = torch.empty_like(prediction)
+        factors = gradient.reshape(-1, *[1] * (prediction.dim() - 1))
+        for out, one, other, factor in cache_slices(result, prediction, target, factors):
+            torch.sub(one, other, out=out).mul_(factor)
+        return result, None
 
 
 def balanced_kl(

@@ -11,6 +11,8 @@ from torch import nn
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
 
+CACHED_NUMBERS = 2**21  # of a feature map that several operations find in the cache, 8 MB
+
 
 def channels_last(module: nn.Sequential) -> nn.Sequential:
     """Store the weights of convolutions as the images come, channels last."""
@@ -80,6 +82,20 @@ def cnn_layer_count(height: int, width: int, wanted: int) -> int:
     return layers
 
 
+def convolve(convolutions: nn.Sequential, inputs: torch.Tensor, largest: int) -> torch.Tensor:
+    """
+    Apply convolutions; on CPUs to as many images at a time as their feature maps fit into a cache.
+
+    :param convolutions: the layers
+    :param inputs: shape ``(n, channels, height, width)``
+    :param largest: numbers of an image's largest feature map
+    """
+    rows = max(CACHED_NUMBERS // largest, 1)
+    if inputs.device.type != "cpu" or len(inputs) <= rows:
+        return convolutions(inputs)
+    return torch.cat([convolutions(part) for part in inputs.split(rows)])
+
+
 class ConvEncoder(nn.Module):
     """
     Strided convolutions, each of which halves the image: 4 layers of depth 32 turn 32x32 into 2x2x256, the report's
@@ -104,9 +120,10 @@ class ConvEncoder(nn.Module):
             channels = out
         self.convolutions = channels_last(nn.Sequential(*modules))
         self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
+        self.largest = depth * height * width // 4
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        return self.convolutions(images).flatten(1)
+        return convolve(self.convolutions, images, self.largest).flatten(1)
 
 
 class ConvDecoder(nn.Module):
@@ -130,10 +147,11 @@ class ConvDecoder(nn.Module):
         for narrow, wide in zip([*widths[1:], channels], widths, strict=True):
             modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU(inplace=True)]
         self.convolutions = channels_last(nn.Sequential(*modules[:-1]))
+        self.largest = depth * height * width // 4
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:
         features = self.linear(feat).unflatten(1, self.feature_map)
-        return self.convolutions(features.contiguous(memory_format=torch.channels_last))
+        return convolve(self.convolutions, features.contiguous(memory_format=torch.channels_last), self.largest)
 
 
 class Encoder(nn.Module):

@@ -46,10 +46,13 @@ class Optimizer:
         gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.clip)
+        used = [gradient for gradient in gradients if gradient is not None]
+        norm = nn.utils.get_total_norm(used)
         if not torch.isfinite(norm):
             self.adam.zero_grad(set_to_none=True)
             raise RuntimeError(f"The gradient of the {self.name} loss ({loss.item():.4g}) became {norm.item()}. {ADVICE}")
+        if norm > self.clip:
+            torch._foreach_mul_(used, self.clip / (norm + 1e-6))
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         if self.weight_decay and self.decayed:

@@ -21,6 +21,7 @@ from torch import nn
 from sb3_cpm.world_model.distributions import Latent
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.networks import GRUCell
+from sb3_cpm.world_model.scan import Scan, Settings, Weights
 
 
 class LatentState(NamedTuple):
@@ -123,6 +124,8 @@ class RSSM(nn.Module):
         actions_in = self.input_action(actions.masked_fill(first, 0.0))
         embed_in = self.posterior_embed(embed)
         noise = None if deterministic else self.latent.noise(length, n, like=state.deter)
+        if noise is not None and mask is None and self._trains_by_hand(embed_in):
+            return self._scan(state, noise, first, actions_in, embed_in)
         resets = is_first.any(dim=1).tolist()
         gaps = None if mask is None else (~mask).any(dim=1).tolist()
 
@@ -142,6 +145,33 @@ class RSSM(nn.Module):
                 )
             rows.append(LatentState(deter, stoch, stats))
         return LatentState(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
+
+    def _trains_by_hand(self, embed_in: torch.Tensor) -> bool:
+        """Where there is a gradient to compute, and neither torch.compile nor mixed precision has the step."""
+        compiled = self._compiled_call_impl is not None
+        return embed_in.requires_grad and not compiled and not torch.is_autocast_enabled(embed_in.device.type)
+
+    def _scan(
+        self,
+        state: LatentState,
+        noise: torch.Tensor,
+        first: torch.Tensor,
+        actions_in: torch.Tensor,
+        embed_in: torch.Tensor,
+    ) -> LatentState:
+        """What :meth:`observe` computes step by step, with the gradient by hand."""
+        settings = Settings(self.latent, self.gru.update_bias, self.gru.norm.eps)
+        weights = Weights(
+            self.input_stoch.weight,
+            self.gru.gates.weight,
+            self.gru.norm.weight,
+            self.gru.norm.bias,
+            self.posterior_deter.weight,
+            self.posterior_out.weight,
+            self.posterior_out.bias,
+        )
+        actions_in, embed_in = actions_in + self.input_stoch.bias, embed_in + self.posterior_deter.bias
+        return LatentState(*Scan.apply(settings, noise, first, state.deter, state.stoch, actions_in, embed_in, *weights))
 
     def prior(self, deter: torch.Tensor) -> torch.Tensor:
         """Parameters of the prior that belongs to a deterministic state, shape ``(*batch, stats_size)``."""
