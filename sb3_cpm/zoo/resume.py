@@ -40,7 +40,7 @@ def kept(manager: Any, model: BaseAlgorithm) -> Iterator[Any]:
         _go_on(Path(manager.trained_agent), model, challengers)
         _remember_evaluations(Path(manager.trained_agent), model, manager.callbacks)
         # not once more the start states and random numbers that the first run began with
-        model.set_random_seed(manager.seed + model.num_timesteps)
+        model.set_random_seed((manager.seed + model.num_timesteps) % 2**31)
     if manager.save_freq > 0:
         manager.callbacks.append(_Checkpoints(folder, manager.save_freq, challengers, manager.save_replay_buffer))
     try:
