@@ -249,6 +249,7 @@ def _curves(axis: Any, rows: list[dict[str, str]], learnt: tuple[str, ...], triv
             name = trivial[number].replace("_", " ")
             axis.axhline(float(rows[0][trivial[number]]), color=colour, ls="--", lw=1.2, label=name)
     axis.set_xscale("symlog", linthresh=10)
+    axis.set_xlim(left=0)
     axis.set_yscale("log")
     axis.set_title(f"Held-out {what}")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -1,0 +1,236 @@
+"""What is computed by hand for speed gives what PyTorch gives: products, the scan, errors, disagreement."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from challenger_helpers import BOTH, random_batch, small
+from torch import nn
+
+from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
+from sb3_cpm.uncertainty.scale import root
+from sb3_cpm.world_model import linear as linear_module
+from sb3_cpm.world_model.acceleration import cache_slices
+from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
+from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
+from sb3_cpm.world_model.losses import squared_error
+from sb3_cpm.world_model.networks import ConvDecoder, ConvEncoder
+from sb3_cpm.world_model.rssm import RSSM, LatentState
+
+LATENTS = [GaussianLatent(4), CategoricalLatent(3, 5)]
+
+
+def leaves(*shapes: tuple[int, ...], dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
+    return [torch.randn(*shape, dtype=dtype, requires_grad=True) for shape in shapes]
+
+
+def gradients(function: Callable[..., torch.Tensor], inputs: list[torch.Tensor]) -> list[torch.Tensor]:
+    """The result, and the gradients of a random weighting of it."""
+    torch.manual_seed(7)
+    result = function(*inputs)
+    return [result, *torch.autograd.grad((result * torch.randn_like(result)).sum(), inputs)]
+
+
+def assert_equal(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float) -> None:
+    for one, other in zip(found, expected, strict=True):
+        assert torch.allclose(one, other, rtol=tolerance, atol=tolerance * other.abs().max().item())
+
+
+# ---- dense layers ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not linear_module.onednn_works(), reason="PyTorch was built without oneDNN's operator")
+@pytest.mark.parametrize("batch", [(64,), (100,), (7, 10)])
+def test_products_are_those_of_pytorch(batch: tuple[int, ...]) -> None:
+    inputs = leaves((*batch, 30), (20, 30), (20,))
+    assert is_faster(inputs[0])
+    assert_equal(gradients(linear, inputs), gradients(F.linear, inputs), 1e-5)
+    flat = [inputs[0].detach().flatten(0, -2).requires_grad_(True), *leaves((30, 20), (20,))]
+    assert_equal(gradients(affine, flat), gradients(lambda x, w, b: x @ w + b, flat), 1e-5)
+
+
+def test_a_gradient_without_strides() -> None:
+    inputs = leaves((70, 5), (3, 5), (3,))
+    found = torch.autograd.grad(linear(*inputs).sum(), inputs)
+    assert_equal(list(found), list(torch.autograd.grad(F.linear(*inputs).sum(), inputs)), 1e-5)
+
+
+def test_everything_else_is_left_to_pytorch() -> None:
+    assert not is_faster(torch.zeros(10, 30)), "few rows"
+    assert not is_faster(torch.zeros(100, 30, dtype=torch.float64))
+    assert not is_faster(torch.zeros(0, 30))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert not is_faster(torch.zeros(100, 30))
+        assert Linear(30, 20)(torch.zeros(100, 30)).dtype == torch.bfloat16
+
+
+def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch, losses = random_batch(BOTH, 2), []
+    for works in (linear_module.onednn_works(), False):
+        monkeypatch.setattr(linear_module, "onednn_works", lambda works=works: works)
+        torch.manual_seed(0)
+        challenger = small(BOTH, imagination_starts=None, sequence_length=32)
+        losses.append([challenger.train(batch)["world_model_loss"] for _ in range(3)])
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_the_check_for_the_operator_draws_no_random_numbers() -> None:
+    state = torch.get_rng_state()
+    linear_module.onednn_works.__wrapped__()
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_frozen_weights_get_no_gradient_and_inputs_do() -> None:
+    net, inputs = nn.Sequential(Linear(5, 4), Linear(4, 1)), torch.randn(70, 5, requires_grad=True)
+    with frozen(net):
+        result = net(inputs).sum()
+    assert all(parameter.requires_grad for parameter in net.parameters())
+    assert torch.autograd.grad(result, inputs, retain_graph=True)[0].abs().sum() > 0
+    assert torch.autograd.grad(result, list(net.parameters()), allow_unused=True) == (None,) * 4
+    net[0].bias.requires_grad_(False)
+    with pytest.raises(KeyError), frozen(net):
+        raise KeyError
+    assert [parameter.requires_grad for parameter in net.parameters()] == [True, False, True, True]
+
+
+# ---- scan ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("latent", LATENTS)
+def test_the_scan_by_hand_is_the_plain_one(latent: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In float64, with resets in the middle: all three outputs, and the gradients of every weight and input."""
+    monkeypatch.setattr(torch.Tensor, "float", lambda tensor: tensor)  # which guards float32 where mixed precision is on
+    rssm = RSSM(latent, deter_size=6, hidden_size=7, embed_dim=9, action_dim=2).double()
+    for parameter in rssm.parameters():
+        nn.init.normal_(parameter, std=0.5)
+    is_first = torch.zeros(8, 4, dtype=torch.bool)
+    is_first[0] = is_first[3, 1] = is_first[5] = True
+    embed, actions = leaves((8, 4, 9), (8, 4, 2), dtype=torch.float64)
+    start = LatentState(*(torch.randn_like(part) for part in rssm.initial_state(4)))
+    trained = [embed, actions, *(weight for name, weight in rssm.named_parameters() if "prior" not in name)]
+    results = []
+    for by_hand in (True, False):
+        monkeypatch.setattr(rssm, "_trains_by_hand", lambda _, by_hand=by_hand: by_hand)
+        torch.manual_seed(1)
+        states = rssm.observe(embed, actions, is_first, state=start)
+        assert ("Scan" in type(states.deter.grad_fn).__name__) == by_hand
+        torch.manual_seed(2)
+        loss = sum((part * torch.randn_like(part)).sum() for part in states)
+        results.append([*states, *torch.autograd.grad(loss, trained)])
+    assert_equal(*results, 1e-12)
+
+
+def test_the_scan_by_hand_trains_and_everything_else_does_not_use_it() -> None:
+    challenger = small(BOTH)
+    output = challenger.world_model.loss(challenger._to_device(random_batch(BOTH, 2)))
+    names, nodes = set(), [output.losses["kl"].grad_fn]
+    while nodes:
+        node = nodes.pop()
+        if node is not None and node not in names:
+            names.add(node)
+            nodes += [following for following, _ in node.next_functions]
+    assert any("Scan" in type(node).__name__ for node in names)
+    rssm, embed = challenger.world_model.rssm, torch.zeros(1, requires_grad=True)
+    assert rssm._trains_by_hand(embed) and not rssm._trains_by_hand(embed.detach())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert not rssm._trains_by_hand(embed)
+
+
+@pytest.mark.parametrize("latent", LATENTS)
+def test_samples_pull_gradients_back(latent: Any) -> None:
+    (stats,) = leaves((6, latent.stats_size), dtype=torch.float64)
+    noise = latent.noise(6, like=stats)
+    sample = latent.sample(stats, noise)
+    gradient = torch.randn_like(sample)
+    by_hand = latent.pull_back(latent.slopes(stats, noise), gradient)
+    assert_equal([by_hand], list(torch.autograd.grad(sample, stats, gradient)), 1e-12)
+
+
+def test_categorical_samples_are_exactly_one_hot_and_avoid_what_is_impossible() -> None:
+    latent = CategoricalLatent(2, 4)
+    logits = torch.tensor([0.0, -200.0, 0.0, -200.0]).repeat(5000, 2)
+    sample = latent.sample(logits, latent.noise(5000, like=logits)).view(-1, 4)
+    assert torch.equal(sample.unique(), torch.tensor([0.0, 1.0])) and torch.equal(sample.sum(-1), torch.ones(10000))
+    assert sample[:, [1, 3]].sum() == 0 and 0.45 < sample[:, 0].mean() < 0.55
+    almost_one = torch.full((1, 2), 1.0 - 2.0**-24)  # the greatest that torch.rand gives
+    assert latent.sample(torch.randn(1, 8), almost_one).sum() == 2
+
+
+@pytest.mark.parametrize("latent", LATENTS)
+def test_both_sides_of_the_kl(latent: Any) -> None:
+    posterior, prior = leaves((7, latent.stats_size), (7, latent.stats_size), dtype=torch.float64)
+    for found, expected in zip(
+        latent.kl_sides(posterior, prior),
+        (latent.kl(posterior.detach(), prior), latent.kl(posterior, prior.detach())),
+        strict=True,
+    ):
+        assert torch.allclose(found, expected)
+        pairs = (torch.autograd.grad(side.sum(), [posterior, prior], allow_unused=True) for side in (found, expected))
+        for one, other in zip(*pairs, strict=True):
+            assert (one is None or not one.any()) if other is None else torch.allclose(one, other)
+
+
+# ---- in slices -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(130, 3, 4, 4), (5, 3), (9,)])
+def test_squared_error(shape: tuple[int, ...]) -> None:
+    prediction, target = leaves(shape, shape, dtype=torch.float64)
+    target = target.detach()
+    plain = lambda one: 0.5 * (one - target).square().reshape(len(one), -1).sum(1)  # noqa: E731
+    assert_equal(gradients(lambda one: squared_error(one, target), [prediction]), gradients(plain, [prediction]), 1e-12)
+
+
+def test_slices_are_all_rows_in_order() -> None:
+    rows = torch.arange(10).view(10, 1)
+    slices = list(cache_slices(rows, 2 * rows, rows=4))
+    assert [len(one) for one, _ in slices] == [4, 4, 2]
+    assert torch.equal(torch.cat([other for _, other in slices]), 2 * rows)
+
+
+def test_convolutions_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, decoder = ConvEncoder((3, 16, 16), depth=4, layers=2), ConvDecoder(6, (3, 16, 16), depth=4, layers=2)
+    results = []
+    for numbers in (1000, 10**9):
+        monkeypatch.setattr("sb3_cpm.world_model.networks.CACHED_NUMBERS", numbers)
+        torch.manual_seed(3)
+        feat, images = leaves((9, 6), (9, 3, 16, 16))
+        weights = [*encoder.parameters(), *decoder.parameters()]
+        embed, drawn = encoder(images), decoder(feat)
+        loss = (embed * torch.randn_like(embed)).sum() + (drawn * torch.randn_like(drawn)).sum()
+        results.append([embed, drawn, *torch.autograd.grad(loss, [feat, images, *weights])])
+    assert_equal(*results, 1e-5)
+
+
+# ---- ensemble --------------------------------------------------------------------------------------------------------
+
+
+def test_heads_one_by_one_are_the_heads_at_once() -> None:
+    ensemble, (inputs,) = Ensemble(3, 5, 2, layers=2, units=7), leaves((70, 5))
+    weights = [inputs, *ensemble.parameters()]
+    results = []
+    for outputs in (torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)):
+        torch.manual_seed(4)
+        results.append([outputs, *torch.autograd.grad((outputs * torch.randn_like(outputs)).sum(), weights)])
+    assert_equal(*results, 1e-4)
+
+
+def test_disagreement_and_its_gradient() -> None:
+    heads = leaves(*[(150, 4)] * 3, dtype=torch.float64)
+
+    def plain(*predictions: torch.Tensor) -> torch.Tensor:
+        stacked = torch.stack(predictions)
+        return root((stacked - stacked.mean(0)).square().mean(0)).mean(-1)
+
+    assert_equal(gradients(lambda *predictions: disagreement(predictions), heads), gradients(plain, heads), 1e-9)
+    same = heads[:1] * 3
+    assert disagreement(same).abs().max() == 0 and torch.isfinite(torch.autograd.grad(disagreement(same).sum(), same)[0]).all()
+    assert disagreement([one.view(3, 50, 4) for one in heads]).shape == (3, 50)
+
+
+def test_ensemble_loss_is_per_head() -> None:
+    heads, target = leaves(*[(6, 4)] * 3, dtype=torch.float64), torch.randn(6, 4, dtype=torch.float64)
+    expected = 0.5 * (torch.stack(heads) - target).square().sum((0, 2)).mean()
+    assert torch.allclose(ensemble_loss(heads, target), expected)
