@@ -34,11 +34,11 @@ from sb3_cpm.presets import make_preset
 
 FOLDER = Path(__file__).parents[1] / "results" / "dreamer"
 EPISODES = 10
-TRAIN_FREQ, LEARNING_STARTS = 5, 1000
+LEARNING_STARTS = 1000
 NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
 TASKS: dict[str, dict[str, Any]] = {
-    "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, solved=-200),
-    "pendulum_pixels": dict(id="pixels:PendulumPixels-v0", steps=8000, every=1000, solved=-200),
+    "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, last_rate=1e-4, solved=-200),
+    "pendulum_pixels": dict(id="pixels:PendulumPixels-v0", steps=8000, every=1000, train_freq=3, last_rate=3e-4, solved=-200),
 }
 
 
@@ -50,8 +50,8 @@ def run_dreamer(env: str, seed: int, path: Path) -> None:
     task, table, start = TASKS[env], Table(path), time.process_time()
     policy = "MultiInputPolicy" if isinstance(gym.make(task["id"]).observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = Dreamer(
-        policy, make_env(env, seed=seed), LinearSchedule(1e-3, 1e-4, 1.0), learning_starts=LEARNING_STARTS,
-        train_freq=TRAIN_FREQ, seed=seed, device="cpu",
+        policy, make_env(env, seed=seed), LinearSchedule(1e-3, task["last_rate"], 1.0), learning_starts=LEARNING_STARTS,
+        train_freq=task["train_freq"], seed=seed, device="cpu",
     )  # fmt: skip
 
     def record(step: int, returns: list[float], lengths: list[int]) -> None:
@@ -70,7 +70,7 @@ def run_sheeprl(env: str, seed: int, path: Path, python: str) -> None:
     task = TASKS[env]
     settings = dict(
         env=env, id=task["id"], seed=seed, steps=task["steps"], every=task["every"], episodes=EPISODES, path=str(path),
-        learning_starts=LEARNING_STARTS, train_freq=TRAIN_FREQ, preset=make_preset(),
+        learning_starts=LEARNING_STARTS, train_freq=task["train_freq"], last_rate=task["last_rate"], preset=make_preset(),
     )  # fmt: skip
     script = Path(__file__).parent / "peers" / "sheeprl_learning.py"
     subprocess.run([python, str(script), json.dumps(settings)], check=True)

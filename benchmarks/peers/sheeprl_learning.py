@@ -77,6 +77,16 @@ def unscale(actions: np.ndarray, space: Any) -> np.ndarray:
     return space.low + 0.5 * (actions.reshape(-1, *space.shape) + 1) * (space.high - space.low)
 
 
+def set_learning_rates(peer: SheeprlDreamer, preset: dict[str, Any], share: float) -> None:
+    """
+    :param preset: names the rates
+    :param share: what the schedule leaves of them
+    """
+    for name, entry in (("world_optimizer", "model_lr"), ("actor_optimizer", "actor_lr"), ("critic_optimizer", "critic_lr")):
+        for group in peer.modules[name].param_groups:
+            group["lr"] = share * preset[entry]
+
+
 def main(env: str, id: str, seed: int, steps: int, every: int, episodes: int, path: str, **settings: Any) -> None:
     start = time.process_time()
     th.set_num_threads(1)
@@ -85,9 +95,6 @@ def main(env: str, id: str, seed: int, steps: int, every: int, episodes: int, pa
     train_env.action_space.seed(seed)
     space = as_dict_space(train_env.observation_space)
     peer = SheeprlDreamer(settings["preset"], space, train_env.action_space.shape[0])
-    for name, entry in (("world_optimizer", "model_lr"), ("actor_optimizer", "actor_lr"), ("critic_optimizer", "critic_lr")):
-        for group in peer.modules[name].param_groups:
-            group["lr"] = settings["preset"][entry]
     buffer = CPMBuffer(100_000, space, train_env.action_space, challenge_ratio=0)
     player, table, updates = Player(peer, 1), Table(Path(path)), 0
 
@@ -111,6 +118,9 @@ def main(env: str, id: str, seed: int, steps: int, every: int, episodes: int, pa
         following = as_dict(observations) if last is None else {key: value[None] for key, value in as_dict(last).items()}
         buffer.add(dict(as_dict(previous)), dict(following), action, rewards, first, infos)
         if step > settings["learning_starts"] and step % settings["train_freq"] == 0 and buffer.episodes_ended:
+            set_learning_rates(
+                peer, settings["preset"], 1 - (1 - settings["last_rate"] / settings["preset"]["model_lr"]) * step / steps
+            )
             peer.train(buffer.sample_sequences(settings["preset"]["batch_size"], settings["preset"]["sequence_length"]))
             updates += 1
         if step % every == 0:
