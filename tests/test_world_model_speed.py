@@ -38,35 +38,43 @@ def assert_equal(found: list[torch.Tensor], expected: list[torch.Tensor], tolera
         assert torch.allclose(one, other, rtol=tolerance, atol=tolerance * other.abs().max().item())
 
 
+@pytest.fixture
+def small_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also small matrices are multiplied by oneDNN."""
+    monkeypatch.setattr(linear_module, "MIN_MULTIPLICATIONS", 0)
+
+
 # ---- dense layers ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not linear_module.onednn_works(), reason="PyTorch was built without oneDNN's operator")
 @pytest.mark.parametrize("batch", [(64,), (100,), (7, 10)])
-def test_products_are_those_of_pytorch(batch: tuple[int, ...]) -> None:
+def test_products_are_those_of_pytorch(batch: tuple[int, ...], small_products: None) -> None:
     inputs = leaves((*batch, 30), (20, 30), (20,))
-    assert is_faster(inputs[0])
+    assert is_faster(inputs[0], 20)
     assert_equal(gradients(linear, inputs), gradients(F.linear, inputs), 1e-5)
     flat = [inputs[0].detach().flatten(0, -2).requires_grad_(True), *leaves((30, 20), (20,))]
     assert_equal(gradients(affine, flat), gradients(lambda x, w, b: x @ w + b, flat), 1e-5)
 
 
-def test_a_gradient_without_strides() -> None:
+def test_a_gradient_without_strides(small_products: None) -> None:
     inputs = leaves((70, 5), (3, 5), (3,))
     found = torch.autograd.grad(linear(*inputs).sum(), inputs)
     assert_equal(list(found), list(torch.autograd.grad(F.linear(*inputs).sum(), inputs)), 1e-5)
 
 
 def test_everything_else_is_left_to_pytorch() -> None:
-    assert not is_faster(torch.zeros(10, 30)), "few rows"
-    assert not is_faster(torch.zeros(100, 30, dtype=torch.float64))
-    assert not is_faster(torch.zeros(0, 30))
+    assert is_faster(torch.zeros(300, 400), 400) == linear_module.onednn_works()
+    assert not is_faster(torch.zeros(60, 4000), 400), "few rows"
+    assert not is_faster(torch.zeros(300, 40), 40), "small matrices"
+    assert not is_faster(torch.zeros(300, 400, dtype=torch.float64), 400)
+    assert not is_faster(torch.zeros(0, 400), 400)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert not is_faster(torch.zeros(100, 30))
-        assert Linear(30, 20)(torch.zeros(100, 30)).dtype == torch.bfloat16
+        assert not is_faster(torch.zeros(300, 400), 400)
+        assert Linear(400, 400)(torch.zeros(300, 400)).dtype == torch.bfloat16
 
 
-def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch, small_products: None) -> None:
     batch, losses = random_batch(BOTH, 2), []
     for works in (linear_module.onednn_works(), False):
         monkeypatch.setattr(linear_module, "onednn_works", lambda works=works: works)
@@ -82,7 +90,7 @@ def test_the_check_for_the_operator_draws_no_random_numbers() -> None:
     assert torch.equal(state, torch.get_rng_state())
 
 
-def test_frozen_weights_get_no_gradient_and_inputs_do() -> None:
+def test_frozen_weights_get_no_gradient_and_inputs_do(small_products: None) -> None:
     net, inputs = nn.Sequential(Linear(5, 4), Linear(4, 1)), torch.randn(70, 5, requires_grad=True)
     with frozen(net):
         result = net(inputs).sum()
@@ -207,7 +215,7 @@ def test_convolutions_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- ensemble --------------------------------------------------------------------------------------------------------
 
 
-def test_heads_one_by_one_are_the_heads_at_once() -> None:
+def test_heads_one_by_one_are_the_heads_at_once(small_products: None) -> None:
     ensemble, (inputs,) = Ensemble(3, 5, 2, layers=2, units=7), leaves((70, 5))
     weights = [inputs, *ensemble.parameters()]
     results = []

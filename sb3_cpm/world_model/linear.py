@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-MIN_ROWS = 64  # below, calling costs more than multiplying
+MIN_ROWS, MIN_MULTIPLICATIONS = 64, 2**22  # below, calling costs more than multiplying
 
 
 class Linear(nn.Linear):
@@ -37,7 +37,7 @@ def linear(inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
     :param bias: shape ``(size_out,)``
     :return: shape ``(*batch, size_out)``
     """
-    if not is_faster(inputs):
+    if not is_faster(inputs, len(weight)):
         return F.linear(inputs, weight, bias)
     flat = _Product.apply(inputs.reshape(-1, inputs.shape[-1]), weight, bias, False)
     return flat.view(*inputs.shape[:-1], len(weight))
@@ -55,12 +55,13 @@ def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> to
     return _Product.apply(inputs, matrix.t(), bias, True)
 
 
-def is_faster(inputs: torch.Tensor) -> bool:
-    """Whether products with such inputs should be oneDNN's."""
+def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
+    """Whether the product of such inputs with a matrix of ``size_out`` rows should be oneDNN's."""
     return (
         inputs.device.type == "cpu"
         and inputs.dtype == torch.float32
-        and inputs.numel() >= MIN_ROWS * inputs.shape[-1] > 0
+        and inputs.numel() >= MIN_ROWS * inputs.shape[-1]
+        and inputs.numel() * size_out >= MIN_MULTIPLICATIONS
         and not torch.is_autocast_enabled("cpu")
         and not torch.compiler.is_compiling()
         and onednn_works()
