@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -11,6 +12,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env
 from test_vec_env import SMALL, fake, inner, quietly
 
+import sb3_cpm.zoo  # noqa: F401  (registers CPM/...)
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.envs import make_maniskill_env
@@ -68,6 +70,23 @@ def test_rewards_are_those_of_compute_reward(env: GoalView) -> None:
     np.testing.assert_array_equal(env.compute_reward(achieved, desired, [{}] * 3), [0, 0, -1])
     dense = GoalView(env.env, reward="dense")
     np.testing.assert_allclose(dense.compute_reward(achieved, desired), [0, -0.0249, -0.1])
+
+
+@pytest.mark.maniskill
+def test_a_task_made_by_its_registered_id_keeps_its_name(env: GoalView) -> None:
+    """``gym.make`` writes the id it was asked for over ManiSkill's; goals and start states go by the task's own."""
+    view = GoalView(gym.make("CPM/PickCubeState-v1", max_episode_steps=6))
+    view.reset(seed=3)
+    state = view.get_wrapper_attr("get_state")()
+    assert state["env_id"] == "PickCube-v1"
+    observation, _ = env.reset(options={"state": state})
+    np.testing.assert_allclose(observation["achieved_goal"], state_position(view), atol=1e-5)
+    view.close()
+
+
+def state_position(view: GoalView) -> np.ndarray:
+    task: Any = view.unwrapped
+    return task.cube.pose.p[0].numpy()
 
 
 @pytest.mark.maniskill

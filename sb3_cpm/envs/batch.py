@@ -64,6 +64,8 @@ class ManiSkillBatch:
         visuals: Visuals,
     ):
         self.env = env
+        # the task's own name; read now, since gym.make() of an id of ours will write that id over ManiSkill's
+        self.env_id: str = env.spec.id if env.spec is not None else type(env).__name__
         self.num_envs: int = self.env.num_envs
         self.obs_mode = obs_mode
         self.cloud = cloud
@@ -191,10 +193,6 @@ class ManiSkillBatch:
         for part in (host["extra"], host["info"]):
             for key in filter(_is_grasp, part):
                 self._grasps.setdefault(key, np.zeros(self.num_envs, dtype=bool))[rows] = part[key]
-
-    @property
-    def env_id(self) -> str:
-        return self.env.spec.id if self.env.spec is not None else type(self.env).__name__
 
     # ------------------------------------------------------------------ observation
     def _select(self, raw: dict[str, Any], info: dict[str, Any] | None = None) -> dict[str, Any]:

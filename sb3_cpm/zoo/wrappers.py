@@ -6,8 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_cpm.envs import DictObservation, GoalView
-from sb3_cpm.envs.goals import GOALS
+from sb3_cpm.envs import DictObservation
 
 
 class TerminationIsSuccess(gym.Wrapper[Any, Any, Any, Any]):
@@ -29,19 +28,6 @@ def as_dict(env: gym.Env) -> gym.Env:
     :param env: the environment
     """
     return DictObservation(env) if isinstance(env.observation_space, spaces.Box) else env
-
-
-def goal_view(env: gym.Env, reward: str = "sparse") -> GoalView:
-    """
-    :class:`~sb3_cpm.envs.GoalView` of a registered task: ``gym.make`` gives a task the name that it was registered under, by
-    which the goals of ManiSkill's tasks are not known.
-
-    :param env: made by gymnasium from one of :data:`sb3_cpm.zoo.ENV_IDS`
-    :param reward: ``"sparse"`` or ``"dense"``
-    :raises ValueError: if the task is not about bringing an object to a place
-    """
-    task = env.spec.kwargs.get("task") if env.spec is not None else None
-    return GoalView(env, GOALS.get(task or ""), reward)
 
 
 class RGBD(gym.ObservationWrapper[Any, Any, Any]):
