@@ -32,3 +32,38 @@ class PendulumPixels(gym.ObservationWrapper):
 
 if "PendulumPixels-v0" not in gym.registry:
     gym.register("PendulumPixels-v0", entry_point="pixels:PendulumPixels")
+
+
+class SquareToCentre(gym.Env):
+    """
+    A bright square on a dark picture is to be moved to the middle; it moves in the plane by the action.
+
+    The picture, a Dict observation ``camera`` of shape ``(32, 32, 1)``, uint8, is all there is to see; episodes begin anywhere.
+    """
+
+    STEP = 0.15  # of the greatest action; the middle is 0, the edges of the picture are -1 and 1
+    HALF = 0.22  # half of the square's side
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Dict({"camera": spaces.Box(0, 255, (SIZE, SIZE, 1), np.uint8)})
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        axis = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+        self._x, self._y = np.meshgrid(axis, -axis)
+        self.position = np.zeros(2)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, np.ndarray], dict]:
+        super().reset(seed=seed)
+        self.position = self.np_random.uniform(-0.8, 0.8, 2)
+        return self._picture(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict]:
+        self.position = np.clip(self.position + self.STEP * np.clip(action, -1, 1), -0.8, 0.8)
+        return self._picture(), -float(np.linalg.norm(self.position)), False, False, {}
+
+    def _picture(self) -> dict[str, np.ndarray]:
+        outside = np.maximum(np.abs(self._x - self.position[0]), np.abs(self._y - self.position[1])) - self.HALF
+        return {"camera": (255 * np.clip(0.5 - outside * SIZE / 2, 0, 1)).astype(np.uint8)[..., None]}
+
+
+if "SquareToCentre-v0" not in gym.registry:
+    gym.register("SquareToCentre-v0", entry_point="pixels:SquareToCentre", max_episode_steps=25)
