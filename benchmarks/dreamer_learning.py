@@ -38,7 +38,7 @@ LEARNING_STARTS = 1000
 NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
 TASKS: dict[str, dict[str, Any]] = {
     "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, last_rate=1e-4, solved=-200),
-    "square_pixels": dict(id="pixels:SquareToCentre-v0", steps=4000, every=500, train_freq=5, last_rate=1e-4, solved=-4),
+    "square_pixels": dict(id="pixels:SquareToCentre-v0", steps=4000, every=500, train_freq=5, last_rate=1e-4, solved=-2),
     "pendulum_pixels": dict(id="pixels:PendulumPixels-v0", steps=8000, every=1000, train_freq=3, last_rate=3e-4, solved=-200),
 }
 

@@ -1,4 +1,4 @@
-"""Pendulum-v1 seen as a small picture: the rod's angle is drawn, how fast it turns has to be remembered."""
+"""Two tasks in small pictures. In Pendulum-v1 the rod's angle is drawn, how fast it turns has to be remembered."""
 
 import gymnasium as gym
 import numpy as np
@@ -38,7 +38,8 @@ class SquareToCentre(gym.Env):
     """
     A bright square on a dark picture is to be moved to the middle; it moves in the plane by the action.
 
-    The picture, a Dict observation ``camera`` of shape ``(32, 32, 1)``, uint8, is all there is to see; episodes begin anywhere.
+    The picture, a Dict observation ``camera`` of shape ``(32, 32, 1)``, uint8, is all there is to see.
+    Episodes begin anywhere.
     """
 
     STEP = 0.15  # of the greatest action; the middle is 0, the edges of the picture are -1 and 1
