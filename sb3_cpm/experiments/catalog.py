@@ -85,7 +85,7 @@ _ALL = (
             2_000,
             5,
             10,
-            cost="30 to 90 CPU seconds per run",
+            cost="1 (SAC) to 2 CPU minutes per run",
         ),
         Plan((MOUNTAINCAR,), 4_000, 1_000, 3, 2, cost="2 minutes on 2 cores"),
     ),
@@ -212,7 +212,7 @@ _ALL = (
         "the report's appendix B.4 is empty",
         DECAYS,
         "decays",
-        Plan((MOUNTAINCAR,), 15_000, 3_000, 5, 5, cost="90 CPU seconds per run"),
+        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 5, cost="90 CPU seconds per run"),
         Plan((TOY,), 1500, 500, 5, 1, SMALL, cost="3 minutes on 2 cores"),
     ),
 )

@@ -52,7 +52,7 @@ def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
         "protocol": protocol,
         "fingerprint": fingerprint(protocol),
         "sb3_cpm": __version__,
-        "versions": versions(),
+        "versions": {name: version for name, version in versions().items() if name != "command"},
     }
 
 
