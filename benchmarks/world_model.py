@@ -266,7 +266,7 @@ def measure_latents(options: Options) -> list[Pair]:
     """
     The whole update (world model, ensemble, explorer): the report's Gaussian latents beside our categorical ones.
 
-    At full speed of both the ratio is that of their operations, 1.9: nearly all are those of the ten heads, whose middle layers do
+    At full speed of both the ratio is that of their operations, 1.9: most are those of the ten heads, whose middle layers do
     not depend on the latent. The target dates from categorical latents that lost time elsewhere.
     """
     pairs = []

@@ -3,8 +3,9 @@ Dense layers that are as fast as the processor allows, and weights that are left
 
 On CPUs PyTorch multiplies float32 matrices with MKL, which on AMD's processors reaches half of the speed of oneDNN, which
 PyTorch brings along for convolutions (measured: 100 and 210 GFLOP/s on one core of an EPYC with AVX-512). The operator that
-reaches oneDNN is the one that ``torch.compile`` generates for dense layers. It has no gradient of its own, hence the three products here. Where it is missing or something else
-is asked for (a GPU, float64, mixed precision, compiling, few rows), everything is PyTorch's own.
+reaches oneDNN is the one that ``torch.compile`` generates for dense layers. It has no gradient of its own, hence the three
+products here. Where it is missing or something else is asked for (a GPU, float64, mixed precision, compiling, small matrices),
+everything is PyTorch's own.
 """
 
 import functools
