@@ -687,3 +687,13 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing():
     with pytest.raises(RuntimeError, match="'reward': nan"):
         model.train(1)
     assert all(np.array_equal(value, before[key], equal_nan=True) for key, value in weights(model).items())
+
+
+def test_pretraining_comes_once_before_the_first_action_of_the_behavior():
+    model = counting(learning_starts=20, train_freq=10, pretrain_steps=7).learn(40)
+    assert model._n_updates == model.challenger.trained_updates == 1 + 7 + 1
+    started = Dreamer(
+        "MlpPolicy", Counting(), start_from=model, learning_starts=10, train_freq=10, pretrain_steps=7, device="cpu"
+    )
+    started.learn(20)
+    assert started._n_updates == 1, "what has learnt already needs none"

@@ -62,6 +62,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         learning_starts: int,
         train_freq: int | tuple[int, str],
         gradient_steps: int,
+        pretrain_steps: int,
         action_noise: ActionNoise | None,
         replay_buffer_class: type[ReplayBuffer] | None,
         replay_buffer_kwargs: dict[str, Any] | None,
@@ -104,6 +105,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             seed=seed,
             sde_support=False,
         )
+        self.pretrain_steps = pretrain_steps
         #: Recurrent state after the last action of ``learn()``; None before the first.
         self._state: RecurrentState | None = None
         self._random_state: RandomState | None = None
@@ -233,6 +235,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             self._logger = configure_logger(verbose=0)
         self.policy.set_training_mode(True)
         self._adapt_learning_rates()
+        if self.challenger.trained_updates == 0:
+            gradient_steps += self.pretrain_steps
         for _ in range(gradient_steps):
             batch = buffer.sample_sequences(
                 batch_size or self.batch_size, self.challenger.sequence_length, self.challenger.keys

@@ -35,6 +35,8 @@ class Dreamer(DreamerAlgorithm):
         episode to end
     :param train_freq: steps (of each environment) between two rounds of updates, or ``(n, "episode")``
     :param gradient_steps: updates per round; -1: as many as transitions were collected
+    :param pretrain_steps: further updates at the very first round, before the behaviour acts for the first time: a behaviour
+        that has learnt from a model that knew nothing yet may collect data that teach it nothing else (DreamerV2 has 100)
     :param action_noise: added to the actions of ``learn()`` within [-1, 1]; the policy is stochastic without it
     :param replay_buffer_class: a :class:`~sb3_cpm.buffers.CPMBuffer`
     :param replay_buffer_kwargs: its arguments, for example ``storage_dtypes`` or ``memmap_dir``
@@ -64,6 +66,7 @@ class Dreamer(DreamerAlgorithm):
         learning_starts: int = 1000,
         train_freq: int | tuple[int, str] = 5,
         gradient_steps: int = 1,
+        pretrain_steps: int = 0,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -86,6 +89,7 @@ class Dreamer(DreamerAlgorithm):
             learning_starts=learning_starts,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
+            pretrain_steps=pretrain_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,

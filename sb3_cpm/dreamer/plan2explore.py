@@ -37,6 +37,7 @@ class Plan2Explore(DreamerAlgorithm):
     :param learning_starts: as for Dreamer
     :param train_freq: as for Dreamer
     :param gradient_steps: as for Dreamer
+    :param pretrain_steps: as for Dreamer
     :param action_noise: as for Dreamer
     :param replay_buffer_class: as for Dreamer
     :param replay_buffer_kwargs: as for Dreamer
@@ -68,6 +69,7 @@ class Plan2Explore(DreamerAlgorithm):
         learning_starts: int = 1000,
         train_freq: int | tuple[int, str] = 5,
         gradient_steps: int = 1,
+        pretrain_steps: int = 0,
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -93,6 +95,7 @@ class Plan2Explore(DreamerAlgorithm):
             learning_starts=learning_starts,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
+            pretrain_steps=pretrain_steps,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
