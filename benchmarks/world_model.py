@@ -9,6 +9,8 @@ other, and its share of a run.
     OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 behavior --threads 1 --repeats 7
     python benchmarks/world_model.py --device cuda                          # also with bfloat16 and torch.compile
 
+On a busy machine set ``OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=0``: two threads that wait by spinning take it from each other.
+
 Contestants live in one process and take turns on the same batches, so that what else the machine does disturbs both alike;
 every number is the median over the turns, every ratio the median of the turns' ratios, after one turn that warms up. Ratios
 are of CPU seconds with one thread, and of wall time with more or on a GPU. Prints markdown tables; exits with 1 if a target is
