@@ -3,7 +3,7 @@ Sizes and constants of the challenger as plain data (report, section 4.1 and B.1
 
 ``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. ``"default"`` is
 small enough for two CPU cores: an update takes about 0.1 CPU seconds for vectors and 0.15 for two 32x32 cameras. ``"report"``
-takes 8 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
+takes 4 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
 ``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that
 differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
 """
@@ -62,7 +62,7 @@ REPORT: dict[str, Any] = {
     "critic_units": 400,  # size of each of them
     "slow_target": True,  # bootstrap from a slow copy of the critic
     "slow_target_every": 100,  # updates between two copies
-    "train_task_behavior": False,  # also train an actor-critic for the task, which the challenger beside a player does not need
+    "train_task_behavior": False,  # actor-critic for the task, which the challenger beside a player does not need
     "train_exploration_behavior": True,  # novelty measure and exploration actor-critic, which a plain Dreamer does not need
     # speed, see sb3_cpm.world_model.acceleration
     "amp": False,  # train in bfloat16 mixed precision; pays on GPUs
