@@ -37,10 +37,12 @@ EPISODES = 10
 LEARNING_STARTS = 1000
 NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
 TASKS: dict[str, dict[str, Any]] = {
-    "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, last_rate=1e-4, solved=-200),
-    "square_pixels": dict(id="pixels:SquareToCentre-v0", steps=6000, every=500, train_freq=5, last_rate=3e-4, solved=-2),
+    "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, pretrain=0, last_rate=1e-4, solved=-200),
+    "square_pixels": dict(
+        id="pixels:SquareToCentre-v0", steps=4000, every=500, train_freq=5, pretrain=300, last_rate=3e-4, solved=-2
+    ),
     "pendulum_pixels": dict(
-        id="pixels:PendulumPixels-v0", steps=12_000, every=1000, train_freq=3, last_rate=3e-4, solved=-200
+        id="pixels:PendulumPixels-v0", steps=12_000, every=1000, train_freq=3, pretrain=300, last_rate=3e-4, solved=-200
     ),
 }
 
@@ -54,7 +56,7 @@ def run_dreamer(env: str, seed: int, path: Path) -> None:
     policy = "MultiInputPolicy" if isinstance(gym.make(task["id"]).observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = Dreamer(
         policy, make_env(env, seed=seed), LinearSchedule(1e-3, task["last_rate"], 1.0), learning_starts=LEARNING_STARTS,
-        train_freq=task["train_freq"], seed=seed, device="cpu",
+        train_freq=task["train_freq"], pretrain_steps=task["pretrain"], seed=seed, device="cpu",
     )  # fmt: skip
 
     def record(step: int, returns: list[float], lengths: list[int]) -> None:
