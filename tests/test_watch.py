@@ -83,6 +83,17 @@ def test_errors_are_logged_for_every_key() -> None:
     assert {"kl", "raw_disagreement", "exp_scale"} <= set(metrics)
 
 
+def test_reward_errors_are_on_the_scale_of_the_environment() -> None:
+    """Figure 10f: also where the head learns symlog(reward)."""
+    batch = random_batch(BOTH, 2)
+    batch = batch._replace(rewards=np.full_like(batch.rewards, 40.0))
+    metrics = small(BOTH, symlog_rewards=True).train(batch)
+    assert metrics["reward_error"] == pytest.approx(40.0, abs=3.0)  # a new head says nearly 0
+    assert metrics["relative_reward_error"] == pytest.approx(metrics["reward_error"] / 40.0, rel=1e-5)
+    nothing = small(BOTH).train(batch._replace(rewards=np.zeros_like(batch.rewards)))
+    assert nothing["relative_reward_error"] == 0.0 and np.isfinite(nothing["reward_error"])
+
+
 # ---- the command -------------------------------------------------------------------------------------------------------
 
 

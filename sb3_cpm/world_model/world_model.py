@@ -97,7 +97,9 @@ class WorldModel(nn.Module):
         reconstructions, errors = self._reconstruction_losses(feat, batch)
         losses.update(reconstructions)
         metrics.update(errors)
-        losses.update(self._head_losses(feat, batch))
+        heads, errors = self._head_losses(feat, batch)
+        losses.update(heads)
+        metrics.update(errors)
         return WorldModelOutput(losses, metrics, posterior.detach(), embed.detach())
 
     def _reconstruction_losses(
@@ -119,10 +121,11 @@ class WorldModel(nn.Module):
             )
         return losses, metrics
 
-    def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> dict[str, torch.Tensor]:
+    def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         feat_reward = feat if self.preset["reward_gradient"] else feat.detach()
         target = symlog(batch.rewards) if self.preset["symlog_rewards"] else batch.rewards
-        error = squared_error(self.reward_head(feat_reward).float().squeeze(-1).flatten(), target.flatten())
+        prediction = self.reward_head(feat_reward).float().squeeze(-1)
+        error = squared_error(prediction.flatten(), target.flatten())
         # nothing was received for arriving in a reset state; its stored 0 is no observation of the reward function
         arrived = (batch.mask & ~batch.is_first).flatten()
         losses = {"reward": self.preset["reward_scale"] * masked_mean(error, arrived)}
@@ -131,11 +134,19 @@ class WorldModel(nn.Module):
             goes_on = (~batch.is_terminal).to(logits.dtype)
             entropy = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="none")
             losses["continue"] = self.preset["continue_scale"] * masked_mean(entropy, batch.mask)
-        return losses
+        with torch.no_grad():  # the report's measures of Fig. 10f; without any reward the relative one is 0
+            rewards = batch.rewards.flatten()
+            absolute = masked_mean((self._unsquashed(prediction).flatten() - rewards).abs(), arrived)
+            size = masked_mean(rewards.abs(), arrived)
+            relative = torch.where(size > 0.0, absolute / size.clamp(min=1e-12), torch.zeros_like(size))
+        return losses, {"reward_error": absolute, "relative_reward_error": relative}
 
     def reward(self, feat: torch.Tensor) -> torch.Tensor:
         """Predicted reward for arriving in a state, shape ``(*batch,)``."""
-        prediction = self.reward_head(feat).float().squeeze(-1)
+        return self._unsquashed(self.reward_head(feat).float().squeeze(-1))
+
+    def _unsquashed(self, prediction: torch.Tensor) -> torch.Tensor:
+        """What the reward head says, on the scale of the environment."""
         return symexp(prediction) if self.preset["symlog_rewards"] else prediction
 
     def continue_probability(self, feat: torch.Tensor) -> torch.Tensor:
