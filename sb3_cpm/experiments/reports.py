@@ -105,7 +105,8 @@ def draw(
     other = None if source is None else find_experiment(source)
     figure, notes = draw_experiment(find_experiment(name), results, quick, other, task)
     if notes:
-        figure.supxlabel("Note: " + "; ".join(notes), fontsize=7, wrap=True)
+        # the layout gives room to the legend below and to this, but not to one beside the other: the empty lines are the legend's
+        figure.supxlabel("Note: " + "; ".join(notes) + 3 * "\n", fontsize=7, wrap=True)
     return figure
 
 
