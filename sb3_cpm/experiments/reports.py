@@ -105,7 +105,7 @@ def draw(
     other = None if source is None else find_experiment(source)
     figure, notes = draw_experiment(find_experiment(name), results, quick, other, task)
     if notes:
-        # the layout gives room to the legend below and to this, but not to one beside the other: the empty lines are the legend's
+        # the layout makes room for this and for the legend, but at the same place: the empty lines are the legend's
         figure.supxlabel("Note: " + "; ".join(notes) + 3 * "\n", fontsize=7, wrap=True)
     return figure
 
