@@ -16,13 +16,13 @@ NOWHERE = {"VK_DRIVER_FILES": "/nonexistent.json", "VK_ICD_FILENAMES": "/nonexis
 
 DEB822 = """Types: deb
 # http://snapshot.example/20250520
-URIs: http://mirror.example/debian
+URIs: http://server.example/os
 Suites: bookworm bookworm-updates
 Components: main
 Signed-By: /usr/share/keyrings/debian-archive-keyring.gpg
 
 Types: deb
-URIs: http://mirror.example/debian-security
+URIs: http://server.example/os-security
 Suites: bookworm-security
 Components: main
 """
@@ -43,17 +43,15 @@ def test_backports_copy_mirror_and_key_of_the_release() -> None:
     made = vulkan_install.backports_source({"debian.sources": DEB822}, "bookworm")
     assert made == (
         "sb3-cpm-backports.sources",
-        "Types: deb\nURIs: http://mirror.example/debian\nSuites: bookworm-backports\nComponents: main\n"
+        "Types: deb\nURIs: http://server.example/os\nSuites: bookworm-backports\nComponents: main\n"
         "Signed-By: /usr/share/keyrings/debian-archive-keyring.gpg\n",
     )
 
 
 def test_backports_from_the_old_format() -> None:
-    text = (
-        "# deb http://old.example bookworm main\ndeb [signed-by=/key.gpg] http://mirror.example/debian bookworm main contrib\n"
-    )
+    text = "# deb http://old.example bookworm main\ndeb [signed-by=/key.gpg] http://server.example/os bookworm main contrib\n"
     made = vulkan_install.backports_source({"sources.list": text}, "bookworm")
-    expected = "deb [signed-by=/key.gpg] http://mirror.example/debian bookworm-backports main contrib\n"
+    expected = "deb [signed-by=/key.gpg] http://server.example/os bookworm-backports main contrib\n"
     assert made == ("sb3-cpm-backports.list", expected)
 
 
@@ -71,9 +69,9 @@ def test_no_backports_where_they_make_no_sense(text: str, codename: str | None) 
 
 
 def test_newest_suite_wants_a_mesa_that_sapien_can_use() -> None:
-    old = "mesa-vulkan-drivers | 22.3.6-1+deb12u1 | http://mirror.example/debian bookworm/main amd64 Packages\n"
-    new = "mesa-vulkan-drivers | 25.0.7-2~bpo12+1 | http://mirror.example/debian bookworm-backports/main amd64 Packages\n"
-    source = "mesa | 26.0.0-1 | http://mirror.example/debian sid/main Sources\n"
+    old = "mesa-vulkan-drivers | 22.3.6-1+deb12u1 | http://server.example/os bookworm/main amd64 Packages\n"
+    new = "mesa-vulkan-drivers | 25.0.7-2~bpo12+1 | http://server.example/os bookworm-backports/main amd64 Packages\n"
+    source = "mesa | 26.0.0-1 | http://server.example/os sid/main Sources\n"
     assert vulkan_install.newest_suite(old + new + source) == "bookworm-backports"
     assert vulkan_install.newest_suite(old + source) is None
     assert vulkan_install.newest_suite("") is None
