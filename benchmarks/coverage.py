@@ -15,7 +15,6 @@ complete; complete runs are skipped. ``plot`` draws ``results/coverage/coverage.
 """
 
 import argparse
-import csv
 import time
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from learning_curves import Table, curves, draw, interval, read
+from learning_curves import Table, curves, draw, interval, missing, read, write_summary
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cpm.dreamer import Plan2Explore
@@ -115,14 +114,12 @@ def run(agent: str, name: str, seed: int, path: Path) -> None:
 def plot() -> None:
     data = curves(read(FOLDER), "share")
     draw(FOLDER / "coverage.png", data, [env for env in TASKS if any(key[0] == env for key in data)], "share of cells", NAMES)
-    with (FOLDER / "summary.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["env", "agent", "step", "seeds", "mean_share", "ci95", "lowest", "highest"])
-        for (env, agent), steps in sorted(data.items()):
-            for step, values in steps.items():
-                numbers = (values.mean(), interval(values), values.min(), values.max())
-                writer.writerow([env, agent, step, len(values), *(round(float(number), 4) for number in numbers)])
-            print(f"{env} {agent} after {step} steps: {numbers[0]:.1%} +- {numbers[1]:.1%} of the cells, {len(values)} seeds")
+    numbers = {"mean_share": np.mean, "ci95": interval, "lowest": np.min, "highest": np.max}
+    write_summary(FOLDER / "summary.csv", data, numbers, digits=4)
+    for (env, agent), steps in sorted(data.items()):
+        step, values = max(steps.items())
+        share = f"{values.mean():.1%} +- {interval(values):.1%}"
+        print(f"{env} {agent} after {step} steps: {share} of the cells, {len(values)} seeds")
 
 
 def main() -> None:
@@ -136,14 +133,8 @@ def main() -> None:
         plot()
         return
     th.set_num_threads(1)
-    for seed in args.seed:
-        for env in args.env:
-            for agent in args.agent:
-                path = FOLDER / agent / env / f"seed{seed}.csv"
-                if path.exists():
-                    print(f"{path} is there already")
-                else:
-                    run(agent, env, seed, path)
+    for agent, env, seed, path in missing(FOLDER, args.agent, args.env, args.seed):
+        run(agent, env, seed, path)
 
 
 if __name__ == "__main__":

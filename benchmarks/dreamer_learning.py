@@ -14,7 +14,6 @@ the same ten episodes (seeds from 1,000,000 on) deterministically. ``plot`` draw
 """
 
 import argparse
-import csv
 import json
 import subprocess
 import sys
@@ -23,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch as th
-from learning_curves import FixedEpisodes, Table, curves, draw, interval, read
+from learning_curves import FixedEpisodes, Table, curves, draw, interval, missing, read, write_summary
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -87,15 +87,11 @@ def plot() -> None:
         FOLDER / "learning.png", data, [env for env in TASKS if any(key[0] == env for key in data)],
         "return of 10 fixed episodes", NAMES, {env: task["solved"] for env, task in TASKS.items()},
     )  # fmt: skip
-    with (FOLDER / "summary.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["env", "agent", "step", "seeds", "mean_return", "ci95", "worst_seed"])
-        for (env, agent), steps in sorted(data.items()):
-            for step, values in steps.items():
-                numbers = (values.mean(), interval(values), values.min())
-                writer.writerow([env, agent, step, len(values), *(round(float(number), 2) for number in numbers)])
-                if step == max(steps):
-                    print(f"{env} {agent} step {step}: {numbers[0]:.1f} +- {numbers[1]:.1f}, worst seed {numbers[2]:.1f}")
+    numbers = {"mean_return": np.mean, "ci95": interval, "worst_seed": np.min}
+    write_summary(FOLDER / "summary.csv", data, numbers, digits=2)
+    for (env, agent), steps in sorted(data.items()):
+        step, values = max(steps.items())
+        print(f"{env} {agent} step {step}: {values.mean():.1f} +- {interval(values):.1f}, worst seed {values.min():.1f}")
 
 
 def main() -> None:
@@ -110,16 +106,11 @@ def main() -> None:
         plot()
         return
     th.set_num_threads(1)
-    for seed in args.seed:
-        for env in args.env:
-            for agent in args.agent:
-                path = FOLDER / agent / env / f"seed{seed}.csv"
-                if path.exists():
-                    print(f"{path} is there already")
-                elif agent == "dreamer":
-                    run_dreamer(env, seed, path)
-                else:
-                    run_sheeprl(env, seed, path, args.peer_python)
+    for agent, env, seed, path in missing(FOLDER, args.agent, args.env, args.seed):
+        if agent == "dreamer":
+            run_dreamer(env, seed, path)
+        else:
+            run_sheeprl(env, seed, path, args.peer_python)
 
 
 if __name__ == "__main__":

@@ -4,9 +4,10 @@ complete, means with 95% confidence intervals over seeds.
 """
 
 import csv
+import itertools
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,41 @@ class Table:
             writer.writeheader()
             writer.writerows(self.rows)
         os.replace(unfinished, self.path)
+
+
+def missing(
+    folder: Path, agents: Iterable[str], envs: Iterable[str], seeds: Iterable[int]
+) -> Iterator[tuple[str, str, int, Path]]:
+    """:return: agent, environment, seed and file of the runs that are not complete; those that are, are told"""
+    for seed, env, agent in itertools.product(seeds, envs, agents):
+        path = folder / agent / env / f"seed{seed}.csv"
+        if path.exists():
+            print(f"{path} is there already")
+        else:
+            yield agent, env, seed, path
+
+
+def write_summary(
+    path: Path,
+    data: dict[tuple[str, str], dict[int, np.ndarray]],
+    numbers: dict[str, Callable[[np.ndarray], float]],
+    digits: int,
+) -> None:
+    """
+    One row per environment, agent and step.
+
+    :param path: of the CSV file
+    :param data: from :func:`curves`
+    :param numbers: columns, and what stands in them of the values of all seeds
+    :param digits: after the point
+    """
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["env", "agent", "step", "seeds", *numbers])
+        for (env, agent), steps in sorted(data.items()):
+            for step, values in steps.items():
+                row = (round(float(number(values)), digits) for number in numbers.values())
+                writer.writerow([env, agent, step, len(values), *row])
 
 
 def read(folder: Path) -> list[dict[str, str]]:

@@ -9,7 +9,7 @@ differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.cha
 """
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 REPORT: dict[str, Any] = {
@@ -125,7 +125,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
-            raise ValueError(f"Unknown preset {preset!r}.{_suggest(preset, PRESETS)} Valid: {sorted(PRESETS)}.")
+            raise ValueError(f"Unknown preset {preset!r}.{nearest(preset, PRESETS, cutoff=0.0)} Valid: {sorted(PRESETS)}.")
         result = dict(PRESETS[preset])
     elif isinstance(preset, Mapping):
         result, overrides = dict(DEFAULT), {**preset, **overrides}
@@ -133,7 +133,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
         raise ValueError(f"`preset` must be a name ({sorted(PRESETS)}) or a dict of entries, got {preset!r}.")
     for key in overrides:
         if key not in result:
-            raise ValueError(f"Unknown preset entry {key!r}.{_suggest(key, result)} Valid: {sorted(result)}.")
+            raise ValueError(f"Unknown preset entry {key!r}.{nearest(key, result, cutoff=0.0)} Valid: {sorted(result)}.")
     result.update(overrides)
     for key in _POSITIVE_INTEGERS:
         if not isinstance(result[key], int) or isinstance(result[key], bool) or result[key] < 1:
@@ -148,6 +148,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     return result
 
 
-def _suggest(name: str, valid: Mapping[str, Any]) -> str:
-    matches = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)
+def nearest(name: str, valid: Iterable[str], cutoff: float = 0.4) -> str:
+    """:return: a sentence with the most similar name, "" where nothing is; ``cutoff`` 0 always finds one"""
+    matches = difflib.get_close_matches(name, list(valid), n=1, cutoff=cutoff)
     return f" Did you mean {matches[0]!r}?" if matches else ""

@@ -125,18 +125,22 @@ def test_a_killed_run_goes_on_as_if_unbroken(tmp_path, monkeypatch, agent, kille
     assert csv_files(resumed.folder) == csv_files(unbroken.folder)
 
 
+def check_resumed_equals_unbroken(spec, tmp_path, monkeypatch, killed_at):
+    unbroken = perform(spec, tmp_path / "unbroken")
+    revive = kill_at(monkeypatch, killed_at)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path / "broken")
+    revive()
+    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+
+
 def test_hindsight_agent_resumes_too(tmp_path, monkeypatch):
     """SB3's HerReplayBuffer must have its running episode cut at a checkpoint, which is a fresh start."""
     pytest.importorskip("gymnasium_robotics")
     pytest.importorskip("mujoco")
     overrides = {**TINY, "env_kwargs": {"max_episode_steps": 40}}
     spec = replace(make_spec("sac_her", overrides=overrides), env_id="PointMaze_UMaze-v3", env="maze")
-    unbroken = perform(spec, tmp_path / "unbroken")
-    revive = kill_at(monkeypatch, 185)
-    with pytest.raises(Killed):
-        perform(spec, tmp_path / "broken")
-    revive()
-    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+    check_resumed_equals_unbroken(spec, tmp_path, monkeypatch, killed_at=185)
 
 
 def test_dreamer_resumes_too(tmp_path, monkeypatch):
@@ -144,12 +148,7 @@ def test_dreamer_resumes_too(tmp_path, monkeypatch):
     wanted = ("policy", "learning_starts", "buffer_size", "env_kwargs")
     dreamer = {**{key: TINY[key] for key in wanted}, "train_freq": 20, "preset": small}
     spec = replace(make_spec("dreamer"), overrides=dreamer)
-    unbroken = perform(spec, tmp_path / "unbroken")
-    revive = kill_at(monkeypatch, 190)
-    with pytest.raises(Killed):
-        perform(spec, tmp_path / "broken")
-    revive()
-    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+    check_resumed_equals_unbroken(spec, tmp_path, monkeypatch, killed_at=190)
 
 
 def test_on_policy_agent_resumes_too(tmp_path, monkeypatch):
@@ -164,12 +163,7 @@ def test_on_policy_agent_resumes_too(tmp_path, monkeypatch):
         "env_kwargs": {"keys": ["state"]},
     }
     spec = replace(make_spec("ppo_rgbd"), overrides=ppo)
-    unbroken = perform(spec, tmp_path / "unbroken")
-    revive = kill_at(monkeypatch, 130)
-    with pytest.raises(Killed):
-        perform(spec, tmp_path / "broken")
-    revive()
-    assert csv_files(perform(spec, tmp_path / "broken").folder) == csv_files(unbroken.folder)
+    check_resumed_equals_unbroken(spec, tmp_path, monkeypatch, killed_at=130)
 
 
 def test_the_seed_decides(tmp_path):

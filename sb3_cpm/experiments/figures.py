@@ -163,33 +163,38 @@ def _nothing(axes: Axes, text: str) -> None:
 def _draw_scores(experiment: Experiment, table: pd.DataFrame) -> Figure:
     tasks = list(dict.fromkeys(table["env"]))
     figure, grid = _grid(len(tasks), len(SCORES))
-    colours = _colours(experiment)
     for task, row in zip(tasks, grid, strict=True):
         of_task = table[table["env"] == task]
         for (score, words), axes in zip(SCORES.items(), row, strict=True):
-            for agent in _agents(experiment, of_task):
-                of_agent = of_task[of_task["agent"] == agent].dropna(subset=[score])
-                if len(of_agent):
-                    _line(axes, per_seed(of_agent, score), colours[agent], agent)
+            _draw_score(axes, score, experiment, of_task)
             axes.set_title(f"{task}\n{words}" if len(tasks) > 1 else words)
             if score != "return":
                 axes.set_ylim(-0.05, 1.05)
-            if not axes.lines:
-                _nothing(axes, "this task says nothing about success")
+    return _finished(figure, grid)
+
+
+def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFrame) -> None:
+    """One score of all agents on one task."""
+    colours = _colours(experiment)
+    for agent in _agents(experiment, table):
+        of_agent = table[table["agent"] == agent].dropna(subset=[score])
+        if len(of_agent):
+            _line(axes, per_seed(of_agent, score), colours[agent], agent)
+    if not axes.lines:
+        _nothing(axes, "this task says nothing about success")
+
+
+def _finished(figure: Figure, grid: np.ndarray) -> Figure:
+    """With the name of the x axis, and one legend below that has every label once."""
     for axes in grid[-1]:
         axes.set_xlabel("environment steps")
-    _shared_legend(figure, grid)
-    return figure
-
-
-def _shared_legend(figure: Figure, grid: np.ndarray) -> None:
-    """One legend below, with every label once."""
     handles: dict[str, Artist] = {}
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 4), fontsize=9)
+    return figure
 
 
 def _draw_curves(experiment: Experiment, data: Data) -> Figure:
@@ -214,10 +219,7 @@ def _draw_panels(panels: Sequence[Panel], experiment: Experiment, data: Data) ->
         _draw_panel(axes, panel, experiment, table)
     for axes in list(grid.flat)[len(panels) :]:
         axes.axis("off")
-    for axes in grid[-1]:
-        axes.set_xlabel("environment steps")
-    _shared_legend(figure, grid)
-    return figure
+    return _finished(figure, grid)
 
 
 def _draw_panel(axes: Axes, panel: Panel, experiment: Experiment, table: pd.DataFrame) -> None:
@@ -242,19 +244,10 @@ def _draw_decays(experiment: Experiment, data: Data) -> Figure:
     evaluations, diagnostics = data.tables["evaluations"], data.tables["diagnostics"]
     figure, grid = _grid(1, 3)
     _draw_panel(grid[0, 0], PANELS["rewards"][0], experiment, diagnostics)
-    colours = _colours(experiment)
     for axes, score in zip(grid[0, 1:], ("return", "success_once"), strict=True):
         axes.set_title(SCORES[score], fontsize=9.5)
-        for agent in _agents(experiment, evaluations):
-            of_agent = evaluations[evaluations["agent"] == agent].dropna(subset=[score])
-            if len(of_agent):
-                _line(axes, per_seed(of_agent, score), colours[agent], agent)
-        if not axes.lines:
-            _nothing(axes, "this task says nothing about success")
-    for axes in grid[-1]:
-        axes.set_xlabel("environment steps")
-    _shared_legend(figure, grid)
-    return figure
+        _draw_score(axes, score, experiment, evaluations)
+    return _finished(figure, grid)
 
 
 def _panels(name: str) -> Callable[[Experiment, Data], Figure]:

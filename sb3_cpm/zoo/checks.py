@@ -17,6 +17,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_cpm.presets import nearest
 from sb3_cpm.zoo.registration import ENV_IDS, NAMESPACE
 
 #: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
@@ -40,12 +41,6 @@ def algorithms() -> dict[str, type[BaseAlgorithm]]:
     from rl_zoo3.utils import ALGOS
 
     return ALGOS
-
-
-def nearest(name: str, valid: Iterable[str], cutoff: float = 0.4) -> str:
-    """:return: a sentence with the most similar name, "" where nothing is"""
-    matches = difflib.get_close_matches(name, list(valid), n=1, cutoff=cutoff)
-    return f" Did you mean {matches[0]!r}?" if matches else ""
 
 
 def read_entries(path: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ replaces ``policy_kwargs``, in which it would otherwise stand.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from gymnasium import spaces
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
@@ -48,40 +48,25 @@ class PointNetActorCriticPolicy(MultiInputActorCriticPolicy):
     :param observation_space: Dict space
     :param action_space: action space
     :param lr_schedule: learning rate schedule
-    :param features_extractor_class: unless told otherwise, see above
+    :param features_extractor_class: None: see above
     :param kwargs: further arguments of ``MultiInputPolicy``
     """
+
+    default_extractor: ClassVar[type[BaseFeaturesExtractor]] = PointNetExtractor
 
     def __init__(
         self,
         observation_space: spaces.Dict,
         action_space: spaces.Space,
         lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = PointNetExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+        extractor = features_extractor_class or self.default_extractor
+        super().__init__(observation_space, action_space, lr_schedule, features_extractor_class=extractor, **kwargs)
 
 
 class CameraActorCriticPolicy(PointNetActorCriticPolicy):
-    """
-    The same with :class:`CameraExtractor` as the default extractor.
+    """The same with :class:`CameraExtractor` as the default extractor."""
 
-    :param observation_space: Dict space
-    :param action_space: action space
-    :param lr_schedule: learning rate schedule
-    :param features_extractor_class: unless told otherwise, see above
-    :param kwargs: further arguments of ``MultiInputPolicy``
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Dict,
-        action_space: spaces.Space,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = CameraExtractor,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(observation_space, action_space, lr_schedule, features_extractor_class, **kwargs)
+    default_extractor = CameraExtractor
