@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
 from sb3_cpm.world_model.acceleration import cache_slices
-from sb3_cpm.world_model.linear import affine, is_faster
+from sb3_cpm.world_model.linear import affine, is_large
 
 
 class Ensemble(nn.Module):
@@ -54,7 +54,7 @@ class Ensemble(nn.Module):
 
     def predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
         """The same as a sequence of the heads' outputs, each of shape ``(n, output_dim)``, without copying them together."""
-        return self._one_by_one(inputs) if is_faster(inputs, self.biases[0].shape[-1]) else self(inputs).unbind(0)
+        return self._one_by_one(inputs) if is_large(inputs, self.biases[0].shape[-1]) else self(inputs).unbind(0)
 
     def _one_by_one(self, inputs: torch.Tensor) -> list[torch.Tensor]:
         """On CPUs: a head's layers fit into the cache."""

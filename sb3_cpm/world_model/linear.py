@@ -2,15 +2,19 @@
 Dense layers that are as fast as the processor allows, and weights that are left alone for a while.
 
 On CPUs PyTorch multiplies float32 matrices with MKL, which on AMD's processors reaches half of the speed of oneDNN, which
-PyTorch brings along for convolutions (measured: 100 and 210 GFLOP/s on one core of an EPYC with AVX-512). The operator that
-reaches oneDNN is the one that ``torch.compile`` generates for dense layers. It has no gradient of its own, hence the three
-products here. Where it is missing or something else is asked for (a GPU, float64, mixed precision, compiling, small matrices),
-everything is PyTorch's own.
+PyTorch brings along for convolutions (measured: 100 and 210 GFLOP/s on one core of an EPYC with AVX-512). On Intel's it is
+the other way round (measured on one core of a Xeon with AVX-512: MKL 75 to 120, oneDNN 56 to 116 GFLOP/s, slowest for
+transposed matrices), so the processor decides; timing both instead would let two runs with one seed differ in the last bits.
+The operator that reaches oneDNN is the one that ``torch.compile`` generates for dense layers. It has no gradient of its own,
+hence the three products here. Where it is missing or something else is asked for (a GPU, float64, mixed precision, compiling,
+small matrices), everything is PyTorch's own.
 """
 
 import functools
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -45,18 +49,25 @@ def linear(inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
 
 def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
     """
-    The same with the matrix the other way round, ``inputs @ matrix + bias``; only where :func:`is_faster` says so.
+    The same with the matrix the other way round, ``inputs @ matrix + bias``.
 
     :param inputs: shape ``(n, size_in)``
     :param matrix: shape ``(size_in, size_out)``
     :param bias: shape ``(size_out,)``
     :return: shape ``(n, size_out)``
     """
+    if not is_faster(inputs, matrix.shape[-1]):
+        return torch.addmm(bias, inputs, matrix)
     return _Product.apply(inputs, matrix.t(), bias, True)
 
 
 def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
     """Whether the product of such inputs with a matrix of ``size_out`` rows should be oneDNN's."""
+    return is_large(inputs, size_out) and prefers_onednn()
+
+
+def is_large(inputs: torch.Tensor, size_out: int) -> bool:
+    """Whether the product of such inputs with a matrix of ``size_out`` rows keeps a CPU busy, in plain float32."""
     return (
         inputs.device.type == "cpu"
         and inputs.dtype == torch.float32
@@ -64,8 +75,21 @@ def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
         and inputs.numel() * size_out >= MIN_MULTIPLICATIONS
         and not torch.is_autocast_enabled("cpu")
         and not torch.compiler.is_compiling()
-        and onednn_works()
     )
+
+
+@functools.cache
+def prefers_onednn() -> bool:
+    """Whether this process has a processor that is faster with oneDNN, and an oneDNN that works."""
+    return "AuthenticAMD" in processor() and onednn_works()
+
+
+def processor() -> str:
+    """What the operating system says of the processor, its vendor included."""
+    try:
+        return Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # not Linux
+        return platform.processor()
 
 
 @functools.cache
