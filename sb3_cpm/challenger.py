@@ -338,11 +338,11 @@ class Challenger:
 
     def _imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
         return self.uncertainty.novelty(
-            Transitions(imagined.feats[:-1], imagined.actions, imagined.stochs[1:], imagined.deters[1:])
+            Transitions(imagined.feats, imagined.actions, imagined.next_stochs, imagined.next_deters)
         )
 
     def _imagined_reward(self, imagined: Imagination) -> torch.Tensor:
-        return self.world_model.reward(imagined.feats[1:])
+        return self.world_model.reward(imagined.next_feats)
 
     def _tensor(self, array: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return to_tensor(array, self.device).to(dtype)

@@ -56,7 +56,7 @@ class Bandit(ActorCritic):
         stuck = LatentState(torch.zeros(n, 1), torch.zeros(n, 1), torch.zeros(n, 2))
         with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"):
             imagined = self.imagine(Nothing(), stuck)  # type: ignore[arg-type]
-            values = self.target_critic(imagined.feats[1:]).squeeze(-1)
+            values = self.target_critic(imagined.next_feats).squeeze(-1)
             returns = reward(imagined.actions.squeeze(-1)) + 0.5 * values
         objective, _ = self._objective(imagined, returns, values)
         return torch.autograd.grad(objective.mean(), self.actor.net[-1].bias)[0]
@@ -135,7 +135,7 @@ def test_entropy_is_rewarded_by_its_scale(kind: str) -> None:
                 parameter.zero_()
 
         def nothing(imagined: Imagination) -> torch.Tensor:
-            return 0.0 * imagined.feats[1:].sum(-1)
+            return 0.0 * imagined.next_feats.sum(-1)
 
         for _ in range(60):
             metrics = challenger.exploration.update(challenger.world_model, start, nothing, challenger.optimizers)

@@ -32,18 +32,22 @@ from sb3_cpm.world_model.world_model import WorldModel
 
 class Imagination(NamedTuple):
     """
-    :param feats: latents of the states 0..H, shape ``(H + 1, n, feat_dim)``
-    :param stochs: their stochastic part, shape ``(H + 1, n, stoch_size)``
-    :param deters: their deterministic part, shape ``(H + 1, n, deter_size)``
+    What it holds is stacked twice, since the gradient of a slice is as large as what it was cut from.
+
+    :param feats: latents of the states 0..H-1, in which the actions are taken, shape ``(H, n, feat_dim)``
     :param actions: shape ``(H, n, action_dim)``, within [-1, 1]
-    :param entropies: of the actor in the states 0..H-1, shape ``(H, n)``
+    :param entropies: of the actor in these states, shape ``(H, n)``
+    :param next_feats: latents of the states 1..H, in which the actions arrive, shape ``(H, n, feat_dim)``
+    :param next_stochs: their stochastic part, shape ``(H, n, stoch_size)``
+    :param next_deters: their deterministic part, shape ``(H, n, deter_size)``
     """
 
     feats: torch.Tensor
-    stochs: torch.Tensor
-    deters: torch.Tensor
     actions: torch.Tensor
     entropies: torch.Tensor
+    next_feats: torch.Tensor
+    next_stochs: torch.Tensor
+    next_deters: torch.Tensor
 
 
 RewardFunction = Callable[[Imagination], torch.Tensor]
@@ -120,11 +124,12 @@ class ActorCritic(nn.Module):
         # many small operations less than the entropies of single steps
         policy = TruncatedNormal(*(torch.stack(part) for part in zip(*((p.loc, p.scale) for p in policies), strict=True)))
         return Imagination(
-            torch.stack(feats),
-            torch.stack([state.stoch for state in states]),
-            torch.stack([state.deter for state in states]),
+            torch.stack(feats[:-1]),
             torch.stack(actions),
             policy.entropy(),
+            torch.stack(feats[1:]),
+            torch.stack([state.stoch for state in states[1:]]),
+            torch.stack([state.deter for state in states[1:]]),
         )
 
     def update(
@@ -146,8 +151,8 @@ class ActorCritic(nn.Module):
                 imagined = self.imagine(world_model, start)
             rewards = reward(imagined)
             with amp:
-                discounts = self.preset["gamma"] * world_model.continue_probability(imagined.feats[1:])
-                values = self.target_critic(imagined.feats[1:]).float().squeeze(-1)
+                discounts = self.preset["gamma"] * world_model.continue_probability(imagined.next_feats)
+                values = self.target_critic(imagined.next_feats).float().squeeze(-1)
             returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
         reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
@@ -156,7 +161,7 @@ class ActorCritic(nn.Module):
         actor_loss = -(reached * (objective + self.preset["entropy_scale"] * entropies)).mean()
         actor_norm = optimizers[f"{self.name}_actor"].step(actor_loss)
         with amp:
-            predicted = self.critic(imagined.feats[:-1].detach()).float().squeeze(-1)
+            predicted = self.critic(imagined.feats.detach()).float().squeeze(-1)
         critic_loss = (reached * 0.5 * (predicted - returns.detach()).square()).mean()
         critic_norm = optimizers[f"{self.name}_critic"].step(critic_loss)
         self._follow_slowly()
@@ -184,7 +189,7 @@ class ActorCritic(nn.Module):
         kind = self.preset["actor_gradient"]
         if kind == "dynamics":
             return returns, imagined.entropies
-        feats = imagined.feats[:-1].detach()
+        feats = imagined.feats.detach()
         with mixed_precision(feats.device, self.preset["amp"]):
             policy = self.actor(feats)
         with torch.no_grad():

@@ -39,6 +39,14 @@ class MLP(nn.Sequential):
         super().__init__(*modules)
         self.output_dim = input_dim if output_dim is None else output_dim
 
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        """
+        :param inputs: shape ``(*batch, input_dim)``
+        :return: shape ``(*batch, output_dim)``
+        """
+        # as matrices: of more dimensions, a layer returns a view, and an ELU in place on a view has its gradient copied twice
+        return super().forward(inputs.reshape(-1, inputs.shape[-1])).view(*inputs.shape[:-1], self.output_dim)
+
 
 class GRUCell(nn.Module):
     """

@@ -20,7 +20,7 @@ from torch import nn
 
 from sb3_cpm.world_model.distributions import Latent
 from sb3_cpm.world_model.linear import Linear
-from sb3_cpm.world_model.networks import GRUCell
+from sb3_cpm.world_model.networks import MLP, GRUCell
 from sb3_cpm.world_model.scan import Scan, Settings, Weights
 
 
@@ -71,9 +71,7 @@ class RSSM(nn.Module):
         self.input_stoch = Linear(latent.size, hidden_size)
         self.input_action = Linear(action_dim, hidden_size, bias=False)
         self.gru = GRUCell(hidden_size, deter_size)
-        self.prior_net = nn.Sequential(
-            Linear(deter_size, hidden_size), nn.ELU(inplace=True), Linear(hidden_size, latent.stats_size)
-        )
+        self.prior_net = MLP(deter_size, 1, hidden_size, latent.stats_size)
         self.posterior_deter = Linear(deter_size, hidden_size)
         self.posterior_embed = Linear(embed_dim, hidden_size, bias=False)
         self.posterior_out = Linear(hidden_size, latent.stats_size)
