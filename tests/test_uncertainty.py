@@ -81,6 +81,20 @@ def test_the_first_valid_batch_calibrates_k() -> None:
     assert torch.quantile(measure.k * d, 0.75).item() == pytest.approx(1.0, rel=1e-4)
 
 
+def test_the_scale_adapts_to_what_the_heads_said_while_they_learnt() -> None:
+    """No second prediction of the same transitions, unless they are others."""
+    measure, batch, predicted = make(), transitions(600), []
+    raw, predict = measure.raw(batch)[::3].detach(), measure.predict
+    measure.predict = lambda given: predicted.append(len(given.feat)) or predict(given)  # type: ignore[method-assign]
+    measure.loss(batch)
+    assert measure.adapt(batch)["raw_disagreement"] == pytest.approx(raw.mean().item(), rel=1e-5)
+    assert predicted == [600]
+    measure.loss(batch)
+    measure.adapt(transitions(600))
+    measure.adapt(batch)
+    assert predicted == [600, 600, 200, 200]
+
+
 def test_k_is_moved_by_its_factor_only_outside_of_the_intervals() -> None:
     rule = ExpScale(mean_range=(0.4, 1.2), max_range=(1.0, 5.0), factor=1.5)
     inside, low, high = torch.tensor([0.2, 1.4]), torch.tensor([0.1, 0.2]), torch.tensor([1.0, 3.0])

@@ -16,7 +16,7 @@ from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
 from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
 from sb3_cpm.world_model.losses import squared_error
-from sb3_cpm.world_model.networks import ConvDecoder, ConvEncoder
+from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 
 LATENTS = [GaussianLatent(4), CategoricalLatent(3, 5)]
@@ -35,13 +35,15 @@ def gradients(function: Callable[..., torch.Tensor], inputs: list[torch.Tensor])
 
 def assert_equal(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float) -> None:
     for one, other in zip(found, expected, strict=True):
-        assert torch.allclose(one, other, rtol=tolerance, atol=tolerance * other.abs().max().item())
+        size = other.abs().max().item() if other.numel() else 0.0
+        assert torch.allclose(one, other, rtol=tolerance, atol=tolerance * size)
 
 
 @pytest.fixture
 def small_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also small matrices are multiplied by oneDNN."""
+    """Also small matrices are multiplied by oneDNN, on any processor."""
     monkeypatch.setattr(linear_module, "MIN_MULTIPLICATIONS", 0)
+    monkeypatch.setattr(linear_module, "prefers_onednn", linear_module.onednn_works)
 
 
 # ---- dense layers ----------------------------------------------------------------------------------------------------
@@ -64,7 +66,7 @@ def test_a_gradient_without_strides(small_products: None) -> None:
 
 
 def test_everything_else_is_left_to_pytorch() -> None:
-    assert is_faster(torch.zeros(300, 400), 400) == linear_module.onednn_works()
+    assert is_faster(torch.zeros(300, 400), 400) == linear_module.prefers_onednn()
     assert not is_faster(torch.zeros(60, 4000), 400), "few rows"
     assert not is_faster(torch.zeros(300, 40), 40), "small matrices"
     assert not is_faster(torch.zeros(300, 400, dtype=torch.float64), 400)
@@ -74,10 +76,16 @@ def test_everything_else_is_left_to_pytorch() -> None:
         assert Linear(400, 400)(torch.zeros(300, 400)).dtype == torch.bfloat16
 
 
+@pytest.mark.parametrize("vendor, faster", [("AuthenticAMD", True), ("GenuineIntel", False), ("", False)])
+def test_the_processor_decides(vendor: str, faster: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear_module, "processor", lambda: f"vendor_id : {vendor}")
+    assert linear_module.prefers_onednn.__wrapped__() == (faster and linear_module.onednn_works())
+
+
 def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch, small_products: None) -> None:
     batch, losses = random_batch(BOTH, 2), []
     for works in (linear_module.onednn_works(), False):
-        monkeypatch.setattr(linear_module, "onednn_works", lambda works=works: works)
+        monkeypatch.setattr(linear_module, "prefers_onednn", lambda works=works: works)
         torch.manual_seed(0)
         challenger = small(BOTH, imagination_starts=None, sequence_length=32)
         losses.append([challenger.train(batch)["world_model_loss"] for _ in range(3)])
@@ -88,6 +96,24 @@ def test_the_check_for_the_operator_draws_no_random_numbers() -> None:
     state = torch.get_rng_state()
     linear_module.onednn_works.__wrapped__()
     assert torch.equal(state, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (7,), (3, 4), (5, 3, 100)])
+def test_an_mlp_takes_any_batch_and_copies_no_gradient(batch: tuple[int, ...]) -> None:
+    """An ELU in place on a view, which is what a layer returns for more than one batch dimension, would copy it."""
+    net, inputs = MLP(6, 2, 8, 3), torch.randn(*batch, 6, requires_grad=True)
+    result = net(inputs)
+    assert result.shape == (*batch, 3)
+    expected = inputs
+    for layer in net:
+        expected = F.elu(expected) if isinstance(layer, nn.ELU) else F.linear(expected, layer.weight, layer.bias)
+    assert_equal([result], [expected], 1e-5)
+    names, waiting = set(), [result.grad_fn]
+    while waiting:
+        node = waiting.pop()
+        names.add(type(node).__name__)
+        waiting += [parent for parent, _ in node.next_functions if parent is not None]
+    assert "CopySlices" not in names and "EluBackward1" in names
 
 
 def test_frozen_weights_get_no_gradient_and_inputs_do(small_products: None) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
-from sb3_cpm.uncertainty.scale import ExpScale, ScaledUncertainty
+from sb3_cpm.uncertainty.scale import ExpScale, ScaledUncertainty, some_of
 
 __all__ = ["TARGETS", "Ensemble", "ExpScale", "Plan2Explore"]
 
@@ -47,6 +47,7 @@ class Plan2Explore(ScaledUncertainty):
         self.target = target
         output_dim = {"feat": sizes.feat, "stoch": sizes.stoch, "deter": sizes.deter, "embed": sizes.embed}[target]
         self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units)
+        self._rated: tuple[torch.Tensor | None, torch.Tensor | None] = None, None
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:
         """Predictions of all heads, each of shape ``(*batch, target_dim)``."""
@@ -61,7 +62,17 @@ class Plan2Explore(ScaledUncertainty):
         return self.disagreement(transitions)
 
     def loss(self, transitions: Transitions) -> torch.Tensor:
-        return ensemble_loss(self.predict(transitions), self.targets(transitions))
+        predictions = self.predict(transitions)
+        with torch.no_grad():
+            rows = some_of(len(transitions.feat))
+            self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
+        return ensemble_loss(predictions, self.targets(transitions))
+
+    def raw_of_some(self, transitions: Transitions) -> torch.Tensor:
+        """Of the transitions that were learnt from last, as the heads said before that update: it needs no more predictions."""
+        feat, raw = self._rated
+        self._rated = None, None
+        return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
 
     def targets(self, transitions: Transitions) -> torch.Tensor:
         """What the heads shall predict, shape ``(*batch, target_dim)``."""

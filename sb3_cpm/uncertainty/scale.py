@@ -14,13 +14,18 @@ from sb3_cpm.uncertainty.base import LatentSizes, Transitions, Uncertainty
 from sb3_cpm.world_model.linear import frozen
 
 METRICS = ("exp", "log")
-MOST_ROWS = 256  # of a batch, evenly spread, tell the scale as much as all of them
+MOST_ROWS = 256  # of a batch tell the scale as much as all of them
 EPSILON = 1e-6  # keeps the gradient of a root finite where there is no novelty at all
 
 
 def root(mean_square: torch.Tensor) -> torch.Tensor:
     """Square root that is 0 at 0 with a finite gradient there."""
     return ((mean_square + EPSILON**2).sqrt() - EPSILON).clamp(min=0.0)
+
+
+def some_of(n: int) -> slice:
+    """At most ``MOST_ROWS`` of ``n`` rows, evenly spread."""
+    return slice(None, None, -(-n // MOST_ROWS) or 1)
 
 
 class ExpScale:
@@ -127,10 +132,14 @@ class ScaledUncertainty(Uncertainty):
 
     @torch.no_grad()
     def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
-        raw = self.raw(transitions.select(slice(None, None, -(-len(transitions.feat) // MOST_ROWS) or 1)))
+        raw = self.raw_of_some(transitions)
         if self.metric == "exp":
             self._adapt_scale(raw)
         return {"raw_disagreement": raw.mean(), "disagreement": self.rate(raw).mean(), "exp_scale": self.k}
+
+    def raw_of_some(self, transitions: Transitions) -> torch.Tensor:
+        """d of so many transitions that they tell the scale, shape ``(rows,)``."""
+        return self.raw(transitions.select(some_of(len(transitions.feat))))
 
     def _adapt_scale(self, raw: torch.Tensor) -> None:
         if bool(self.calibrated):
