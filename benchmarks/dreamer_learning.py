@@ -3,14 +3,15 @@ How fast Dreamer learns with the default preset: Pendulum-v1 from its state vect
 
 ::
 
-    python benchmarks/dreamer_learning.py run --agent dreamer --env pendulum square_pixels --seed 0 1 2
-    python benchmarks/dreamer_learning.py run --agent sheeprl --env pendulum --seed 0 1 2 --peer-python PATH
+    python benchmarks/dreamer_learning.py run --agent dreamer dreamer_categorical --env pendulum square_pixels
+    python benchmarks/dreamer_learning.py run --agent sheeprl --env pendulum square_pixels --peer-python PATH
     python benchmarks/dreamer_learning.py plot
 
 Every run writes ``results/dreamer/AGENT/ENV/seedN.csv`` when it is complete; complete runs are skipped. Each evaluation plays
 the same ten episodes (seeds from 1,000,000 on) deterministically. ``plot`` draws ``results/dreamer/learning.png`` and writes
 ``results/dreamer/summary.csv``, means over seeds with 95% confidence intervals. sheeprl is run by
-``peers/sheeprl_learning.py`` in an interpreter of its own, with the same sizes, environment steps and updates.
+``peers/sheeprl_learning.py`` in an interpreter of its own, with the same sizes, environment steps and updates. Its latents are
+categorical; ``dreamer_categorical`` is ours with latents of the same kind and size.
 """
 
 import argparse
@@ -35,7 +36,11 @@ from sb3_cpm.presets import make_preset
 FOLDER = Path(__file__).parents[1] / "results" / "dreamer"
 EPISODES = 10
 LEARNING_STARTS = 1000
-NAMES = {"dreamer": "sb3_cpm Dreamer", "sheeprl": "sheeprl dreamer_v2"}
+NAMES = {
+    "dreamer": "sb3_cpm Dreamer",
+    "dreamer_categorical": "sb3_cpm Dreamer, categorical latents",
+    "sheeprl": "sheeprl dreamer_v2",
+}
 TASKS: dict[str, dict[str, Any]] = {
     "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, pretrain=0, last_rate=1e-4, solved=-200),
     "square_pixels": dict(
@@ -51,20 +56,21 @@ def make_env(env: str, n_envs: int = 1, seed: int = 0) -> VecEnv:
     return make_vec_env(TASKS[env]["id"], n_envs, seed=seed)
 
 
-def run_dreamer(env: str, seed: int, path: Path) -> None:
+def run_dreamer(agent: str, env: str, seed: int, path: Path) -> None:
     task, table, start = TASKS[env], Table(path), time.process_time()
     policy = "MultiInputPolicy" if isinstance(gym.make(task["id"]).observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = Dreamer(
         policy, make_env(env, seed=seed), LinearSchedule(1e-3, task["last_rate"], 1.0), learning_starts=LEARNING_STARTS,
         train_freq=task["train_freq"], pretrain_steps=task["pretrain"], seed=seed, device="cpu",
+        preset={"latent": "categorical"} if agent == "dreamer_categorical" else "default",
     )  # fmt: skip
 
     def record(step: int, returns: list[float], lengths: list[int]) -> None:
         cpu = round(time.process_time() - start, 1)
         for episode, (value, length) in enumerate(zip(returns, lengths, strict=True)):
-            table.add(agent="dreamer", env=env, seed=seed, step=step, episode=episode, **{"return": round(value, 4)},
+            table.add(agent=agent, env=env, seed=seed, step=step, episode=episode, **{"return": round(value, 4)},
                       length=length, updates=model._n_updates, cpu_seconds=cpu)  # fmt: skip
-        print(f"dreamer {env} seed {seed} step {step}: {sum(returns) / len(returns):.1f} after {cpu} CPU s", flush=True)
+        print(f"{agent} {env} seed {seed} step {step}: {sum(returns) / len(returns):.1f} after {cpu} CPU s", flush=True)
 
     model.learn(task["steps"], callback=FixedEpisodes(make_env(env, EPISODES), task["every"], record), log_interval=None)
     table.complete()
@@ -75,7 +81,8 @@ def run_sheeprl(env: str, seed: int, path: Path, python: str) -> None:
     task = TASKS[env]
     settings = dict(
         env=env, id=task["id"], seed=seed, steps=task["steps"], every=task["every"], episodes=EPISODES, path=str(path),
-        learning_starts=LEARNING_STARTS, train_freq=task["train_freq"], last_rate=task["last_rate"], preset=make_preset(),
+        learning_starts=LEARNING_STARTS, train_freq=task["train_freq"], pretrain=task["pretrain"],
+        last_rate=task["last_rate"], preset=make_preset(),
     )  # fmt: skip
     script = Path(__file__).parent / "peers" / "sheeprl_learning.py"
     subprocess.run([python, str(script), json.dumps(settings)], check=True)
@@ -107,10 +114,10 @@ def main() -> None:
         return
     th.set_num_threads(1)
     for agent, env, seed, path in missing(FOLDER, args.agent, args.env, args.seed):
-        if agent == "dreamer":
-            run_dreamer(env, seed, path)
-        else:
+        if agent == "sheeprl":
             run_sheeprl(env, seed, path, args.peer_python)
+        else:
+            run_dreamer(agent, env, seed, path)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@ sheeprl's DreamerV2 in the loop of ``benchmarks/dreamer_learning.py``: the same 
 step and evaluation episodes. Acting, losses and optimizers are sheeprl's own (its player, and its ``train()`` as
 :mod:`peers.sheeprl_dreamer` calls it).
 
-Its latent state is categorical, as in its DreamerV2; all other sizes and the learning rates are those of our preset.
+Its latent state is categorical, as in its DreamerV2; all other sizes and the learning rates are those of our preset. It imagines
+from all states of a batch where the preset takes some, and predicts rewards and vectors as they are where the preset squashes
+them.
 """
 
 import json
@@ -121,8 +123,9 @@ def main(env: str, id: str, seed: int, steps: int, every: int, episodes: int, pa
             set_learning_rates(
                 peer, settings["preset"], 1 - (1 - settings["last_rate"] / settings["preset"]["model_lr"]) * step / steps
             )
-            peer.train(buffer.sample_sequences(settings["preset"]["batch_size"], settings["preset"]["sequence_length"]))
-            updates += 1
+            for _ in range(1 if updates else 1 + settings["pretrain"]):
+                peer.train(buffer.sample_sequences(settings["preset"]["batch_size"], settings["preset"]["sequence_length"]))
+                updates += 1
         if step % every == 0:
             record(step)
     table.complete()
