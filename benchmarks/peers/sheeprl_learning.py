@@ -3,9 +3,9 @@ sheeprl's DreamerV2 in the loop of ``benchmarks/dreamer_learning.py``: the same 
 step and evaluation episodes. Acting, losses and optimizers are sheeprl's own (its player, and its ``train()`` as
 :mod:`peers.sheeprl_dreamer` calls it).
 
-Its latent state is categorical, as in its DreamerV2; all other sizes and the learning rates are those of our preset. It imagines
-from all states of a batch where the preset takes some, and predicts rewards and vectors as they are where the preset squashes
-them.
+Its latent state is categorical, as in its DreamerV2; all other sizes and the learning rates are those of our preset. It
+imagines from all states of a batch where the preset takes some, and predicts rewards and vectors as they are where the preset
+squashes them.
 """
 
 import json

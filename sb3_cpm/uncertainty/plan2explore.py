@@ -69,7 +69,7 @@ class Plan2Explore(ScaledUncertainty):
         return ensemble_loss(predictions, self.targets(transitions))
 
     def raw_of_some(self, transitions: Transitions) -> torch.Tensor:
-        """Of the transitions that were learnt from last, as the heads said before that update: it needs no more predictions."""
+        """Of the transitions learnt from last, as the heads predicted then: that needs no further prediction."""
         feat, raw = self._rated
         self._rated = None, None
         return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
