@@ -54,6 +54,19 @@ DECAYS = tuple(
     Contender(f"CPM {name}", "cpm_sac", challenger(decay=name))
     for name in ("constant", "linear", "exponential", "inverse_time", "cosine", "logistic")
 )
+#: What of the method helps or hurts where the report's constants do badly.
+PARTS = (
+    SAC,
+    Contender("CPM-SAC", "cpm_sac"),
+    Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}}),
+    Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
+    Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
+    Contender(
+        "CPM, task rewards",
+        "cpm_sac",
+        {"replay_buffer_kwargs": {"reward_kwargs": {"exploration_ratio": 1e-3, "scale": 1.0}}},
+    ),
+)
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
 
@@ -71,6 +84,16 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 17 CPU minutes per run"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "pickcube-parts",
+        "",
+        "PickCube-v1 from state vectors: parts of the method",
+        "not in the report: for choosing constants, on seeds and evaluation episodes that no other experiment uses",
+        PARTS,
+        "curves",
+        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 1, STATE, "5 to 9 CPU minutes per run", 100, 2_000_000),
+        Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, "5 minutes on 2 cores", 100, 2_000_000),
     ),
     Experiment(
         "mountaincar",

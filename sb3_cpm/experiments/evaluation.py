@@ -36,19 +36,20 @@ def success_of(info: dict[str, Any]) -> bool | None:
     return None if told is None else bool(told)
 
 
-def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> list[Outcome]:
+def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int, first_seed: int = FIRST_SEED) -> list[Outcome]:
     """
-    Play episodes with seeds from ``FIRST_SEED`` on.
+    Play episodes with seeds from ``first_seed`` on.
 
     :param model: the player; recurrent ones get their state back
     :param env: one environment, made like those of the training and not one of them
     :param n_episodes: how many
+    :param first_seed: training has the seeds below ``FIRST_SEED``
     """
     if isinstance(env, VecNormalize) and model.get_vec_normalize_env() is not None:
         assert model.env is not None
         sync_envs_normalization(model.env, env)
         env.training = env.norm_reward = False
-    return [_play(model, env, FIRST_SEED + index) for index in range(n_episodes)]
+    return [_play(model, env, first_seed + index) for index in range(n_episodes)]
 
 
 def _play(model: BaseAlgorithm, env: VecEnv, seed: int) -> Outcome:

@@ -23,6 +23,7 @@ import yaml
 
 from sb3_cpm import __version__
 from sb3_cpm.experiments.specification import RunSpec, fingerprint
+from sb3_cpm.run.evaluation import FIRST_SEED
 from sb3_cpm.run.folder import versions, write_text, write_yaml
 from sb3_cpm.zoo.agents import Agent
 
@@ -47,6 +48,8 @@ def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
         "eval_every": spec.eval_every,
         "eval_episodes": spec.eval_episodes,
     }
+    if spec.eval_seed != FIRST_SEED:  # not otherwise: results of the time before there was a choice keep their fingerprint
+        protocol["eval_seed"] = spec.eval_seed
     return {
         "run": spec.as_dict(),
         "protocol": protocol,

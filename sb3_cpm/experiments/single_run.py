@@ -186,7 +186,7 @@ class Watcher(BaseCallback):
 
     def _evaluate(self) -> None:
         spec = self.spec
-        outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes)
+        outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes, spec.eval_seed)
         step = self.built.model.num_timesteps
         for index, outcome in enumerate(outcomes):
             self.tables["evaluations"].add((spec.experiment, spec.agent, spec.env, spec.seed, step, index, *outcome))

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_cpm.run.evaluation import FIRST_SEED
+
 
 @dataclass(frozen=True)
 class RunSpec:
@@ -23,6 +25,7 @@ class RunSpec:
     :param steps: environment steps to train for
     :param eval_every: environment steps between two evaluations
     :param eval_episodes: episodes of each
+    :param eval_seed: of the first of them, the others' follow
     """
 
     experiment: str
@@ -35,6 +38,7 @@ class RunSpec:
     steps: int
     eval_every: int
     eval_episodes: int
+    eval_seed: int = FIRST_SEED
 
     @property
     def name(self) -> str:
@@ -97,9 +101,12 @@ class Plan:
     :param steps: environment steps of each run
     :param eval_every: steps between evaluations
     :param eval_episodes: episodes of each
-    :param seeds: how many, from 0
+    :param seeds: how many
     :param overrides: by algorithm (``"sac"``, ``"ppo"``, ...), hyperparameters that its runs get
     :param cost: what it takes, in words, measured
+    :param first_seed: of the runs
+    :param eval_seed: of the first evaluation episode. Where something is chosen by its results, both are others than those of
+        the experiments that report what was chosen
     """
 
     tasks: tuple[Task, ...]
@@ -109,6 +116,8 @@ class Plan:
     seeds: int = 3
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     cost: str = ""
+    first_seed: int = 0
+    eval_seed: int = FIRST_SEED
 
 
 @dataclass(frozen=True)
@@ -153,7 +162,7 @@ class Experiment:
     ) -> Iterator[RunSpec]:
         """
         :param quick: the version that takes minutes
-        :param seeds: how many, from 0; None: the plan's number
+        :param seeds: how many, from the plan's first; None: the plan's number
         :param steps: of each run; None: the plan's number
         :param agents: names of contenders; None: all
         :return: all runs, first seeds first
@@ -161,7 +170,7 @@ class Experiment:
         from sb3_cpm.zoo.agents import algorithm_of
 
         plan = self.plan(quick)
-        for seed in range(plan.seeds if seeds is None else seeds):
+        for seed in range(plan.first_seed, plan.first_seed + (plan.seeds if seeds is None else seeds)):
             for task in plan.tasks:
                 for contender in self.contenders:
                     if agents is not None and contender.name not in agents:
@@ -179,6 +188,7 @@ class Experiment:
                         steps=steps or plan.steps,
                         eval_every=plan.eval_every,
                         eval_episodes=plan.eval_episodes,
+                        eval_seed=plan.eval_seed,
                     )
 
 
