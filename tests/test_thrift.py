@@ -60,6 +60,9 @@ def test_episodes_are_equal_to_the_last_bit(monkeypatch: pytest.MonkeyPatch, con
         assert (type(env.unwrapped.agent.controller.controllers["arm"]).__mro__[1].__name__ == "PDEEPoseController") is (
             "ee" in control_mode
         )
+        for thing in (env.unwrapped.cube, env.unwrapped.agent.tcp):
+            assert thing._poses_at_once
+            thing.pose = thing.pose  # can still be set
     monkeypatch.setattr(batch, "save_work", lambda env: None)
     with env_of(lambda: make_maniskill_env("PickCube-v1", obs_mode="state", control_mode=control_mode)) as env:
         plain = episodes(env)

@@ -4,6 +4,7 @@ The same numbers for less work.
 Without a GPU, half of a step of ManiSkill is hundreds of small torch calls on batches of one, each of them some microseconds.
 Part of that work is done twice or comes to nothing, and is left out here, in the environments that we make and nowhere else:
 
+* the pose of a thing becomes four tensors and two arrays before it is one
 * the end-effector controllers ask twice per action where the hand is, and the second answer is not used on a CPU
 * whether the gripper grasps something is worked out from angles between forces, even where there is no force
 * the renderer transforms the triangles of hidden things (the goal marker: a tenth of all) and then draws none of them
@@ -14,6 +15,7 @@ States, rewards and pictures are equal to the last bit (``tests/test_thrift.py``
 import functools
 from typing import Any
 
+import numpy as np
 import torch as th
 
 
@@ -30,9 +32,39 @@ def save_work(env: Any) -> None:
             _save_on_grasps(agent)
             for controller in agent.controllers.values():
                 _save_on_poses(controller)
+    links = [link for articulation in env.scene.articulations.values() for link in articulation.links]
+    for thing in (*env.scene.actors.values(), *links):
+        if len(thing._objs) == 1:
+            thing.__class__ = _poses_at_once(type(thing))  # type: ignore[arg-type]
     for thing in env._hidden_objects:
         if hasattr(thing, "hidden"):
             _save_on_hidden(thing)
+
+
+# ---------------------------------------------------------------------- where things are
+@functools.cache
+def _poses_at_once(thing_class: Any) -> Any:
+    """
+    :param thing_class: ``Actor`` or ``Link``, or a subclass
+    :return: a subclass whose pose is made from the simulator's numbers in one go
+    """
+    from mani_skill.utils.structs import Actor, Pose
+
+    if thing_class.__dict__.get("_poses_at_once"):  # after another building of the scene
+        return thing_class
+    name = "pose" if issubclass(thing_class, Actor) else "entity_pose"
+
+    class PosesAtOnce(thing_class):
+        _poses_at_once = True
+
+        def _pose(self) -> Any:
+            pose = getattr(self._objs[0], name)
+            return Pose(th.from_numpy(np.concatenate((pose.p, pose.q))[None]))
+
+        pose = property(_pose, thing_class.pose.fset)
+
+    PosesAtOnce.__name__ = PosesAtOnce.__qualname__ = thing_class.__name__
+    return PosesAtOnce
 
 
 # ---------------------------------------------------------------------- where the hand is
