@@ -58,14 +58,14 @@ DECAYS = tuple(
 PARTS = (
     SAC,
     Contender("CPM-SAC", "cpm_sac"),
-    Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}}),
-    Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
     Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
+    Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}}),
     Contender(
         "CPM, task rewards",
         "cpm_sac",
         {"replay_buffer_kwargs": {"reward_kwargs": {"exploration_ratio": 1e-3, "scale": 1.0}}},
     ),
+    Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
 )
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
