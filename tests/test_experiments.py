@@ -23,7 +23,7 @@ from sb3_cpm.experiments.collect import collect
 from sb3_cpm.experiments.evaluation import evaluate
 from sb3_cpm.experiments.grid import attempt, perform_all
 from sb3_cpm.experiments.player_losses import player_losses
-from sb3_cpm.experiments.run_folder import locked
+from sb3_cpm.experiments.run_folder import LockedError, locked
 from sb3_cpm.experiments.single_run import Watcher, perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
@@ -340,6 +340,40 @@ def test_processes_of_their_own(tmp_path):
     done = subprocess.run([sys.executable, "-c", script, job, str(tmp_path)], capture_output=True, text=True, timeout=120)
     assert done.stdout.splitlines()[-1] == "['finished', 'crashed']", done.stdout + done.stderr
     assert "signal 9" in (specs[1].folder(tmp_path) / "crashed.txt").read_text()
+
+
+def test_runs_end_with_the_process_that_started_them(tmp_path):
+    """Killed without a chance to say so; what it leaves can be gone on with."""
+    spec = make_spec(steps=10_000_000)
+    script = (
+        "import json, sys, pathlib\n"
+        "from sb3_cpm.experiments.grid import perform_all\nfrom sb3_cpm.experiments.specification import RunSpec\n"
+        "perform_all([RunSpec(**json.loads(sys.argv[1]))], pathlib.Path(sys.argv[2]))\n"
+    )
+    folder = spec.folder(tmp_path)
+    with subprocess.Popen([sys.executable, "-c", script, json.dumps(spec.as_dict()), str(tmp_path)]) as grid:
+        try:
+            wait_until(lambda: (folder / "checkpoint").exists())
+            with pytest.raises(LockedError), locked(folder):
+                pass
+        finally:
+            grid.kill()
+
+    def is_free():
+        try:
+            with locked(folder):
+                return True
+        except LockedError:
+            return False
+
+    wait_until(is_free)
+
+
+def wait_until(holds, seconds=60):
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)
 
 
 def test_jobs_and_seeds_are_checked(tmp_path):

@@ -79,19 +79,21 @@ class _Pool:
         finally:  # Ctrl-C: workers have got it, too, and end by themselves; a second one finds them ended
             for process in self._running.values():
                 process.terminate()
-                process.wait()
+                process.communicate()
         return [self._outcomes[index] for index in range(len(self.specs))]
 
     def _start(self, spec: RunSpec) -> subprocess.Popen:
         job = json.dumps({"spec": spec.as_dict(), "results": str(self.results), "device": self.device})
         environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-        return subprocess.Popen([sys.executable, "-m", "sb3_cpm.experiments.worker", job], env=environment)
+        command = [sys.executable, "-m", "sb3_cpm.experiments.worker", job]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, env=environment)  # nothing is written, see end_with_parent()
 
     def _collect(self) -> None:
         for index, process in list(self._running.items()):
             status = process.poll()
             if status is None:
                 continue
+            process.communicate()
             del self._running[index]
             spec = self.specs[index]
             folder = spec.folder(self.results)

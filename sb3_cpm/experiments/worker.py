@@ -1,7 +1,9 @@
 """One run in a process of its own: ``python -m sb3_cpm.experiments.worker JOB``, which the grid calls."""
 
 import json
+import os
 import sys
+import threading
 from pathlib import Path
 
 from sb3_cpm.experiments.grid import STATUS, attempt
@@ -24,5 +26,16 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, however that ended: its end of our standard input closes then."""
+
+    def wait() -> None:
+        os.read(sys.stdin.fileno(), 1)  # not through the buffer, whose lock the interpreter wants when it ends
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 if __name__ == "__main__":
+    end_with_parent()
     sys.exit(main(sys.argv[1]))
