@@ -415,6 +415,16 @@ def test_evaluation_episodes_of_other_seeds_are_another_protocol(tmp_path):
     assert (first["step"] == other["step"]).all() and (first["return"] != other["return"]).any()
 
 
+def test_some_agents_and_tasks_only(tmp_path, capsys):
+    experiment = EXPERIMENTS["pickcube-state"]
+    specs = list(experiment.runs(agents=["SAC+HER", "SAC"], tasks=["PickCubeState-v1-pd_ee_delta_pos"], seeds=1))
+    assert [spec.agent for spec in specs] == ["SAC", "SAC+HER"] and {spec.env for spec in specs} == {specs[0].env}
+    with pytest.raises(ValueError, match=r"no agent 'CPM_SAC' in this experiment. Did you mean 'CPM-SAC'\? Valid: SAC, CPM"):
+        run_experiment("pickcube-state", agents=["CPM_SAC"], results=tmp_path)
+    assert main(["reproduce", "--figure", "pickcube-state", "--tasks", "PickCube", "--results", str(tmp_path)]) == 1
+    assert "no task 'PickCube'" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_figures_by_number():
     assert find_experiment("4").name == find_experiment("figure4").name == find_experiment("Figure 4").name == "five-agents"
     assert find_experiment("B.3").name == "controllers" and find_experiment("b.4").name == "decays"

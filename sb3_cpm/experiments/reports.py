@@ -1,6 +1,6 @@
 """An experiment from start to figure, and its numbers as a table: what notebooks and the command line call."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,8 @@ def run_experiment(
     tell: Callable[[str], None] = print,
     steps: int | None = None,
     device: str = "cpu",
+    agents: Sequence[str] | None = None,
+    tasks: Sequence[str] | None = None,
 ) -> list[RunResult]:
     """
     Make the runs of an experiment that are not there yet.
@@ -37,18 +39,20 @@ def run_experiment(
     :param name: of an experiment, or a figure's number
     :param quick: the version that takes minutes; its results are kept apart from the full ones
     :param results: folder of all results
-    :param seeds: how many, from 0; None: as planned
+    :param seeds: how many; None: as planned
     :param jobs: processes at a time; 0: in this process
     :param tell: is given lines about the progress
     :param steps: of each run, to try something; None: as planned
     :param device: PyTorch device of the runs
+    :param agents: only these, by name
+    :param tasks: only these, by name
     :return: what became of each run; a crashed one does not stop the others
     :raises ValueError: for an unknown name, with the nearest
     """
     experiment = find_experiment(name)
     if seeds is not None and seeds < 1:
         raise ValueError(f"seeds={seeds}: expected 1 or more")
-    specs = list(experiment.runs(quick, seeds, steps))
+    specs = list(experiment.runs(quick, seeds, steps, agents, tasks))
     return perform_all(specs, Path(results), jobs, tell, device)
 
 
@@ -162,9 +166,13 @@ def reproduce(
     tell: Callable[[str], None] = print,
     steps: int | None = None,
     device: str = "cpu",
+    agents: Sequence[str] | None = None,
+    tasks: Sequence[str] | None = None,
 ) -> int:
     """
     Run what is missing, draw the figure, print the table: what ``python -m sb3_cpm reproduce`` does.
+
+    Of what is drawn, ``agents`` and ``tasks`` change nothing: all results that are there are.
 
     :return: exit status: 1 if a run crashed or was refused
     :raises ValueError: as :func:`run_experiment` and :func:`draw`
@@ -173,9 +181,9 @@ def reproduce(
     failed: list[RunResult] = []
     if not draw_only:
         plan = experiment.plan(quick)
-        n_runs = len(list(experiment.runs(quick, seeds)))
+        n_runs = len(list(experiment.runs(quick, seeds, steps, agents, tasks)))
         tell(f"{experiment.name}: {n_runs} runs of {steps or plan.steps} steps ({plan.cost}); what is there is skipped")
-        outcomes = run_experiment(name, quick, results, seeds, jobs, tell, steps, device)
+        outcomes = run_experiment(name, quick, results, seeds, jobs, tell, steps, device, agents, tasks)
         failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused")]
         for outcome in failed:
             tell(f"{outcome.outcome}: {outcome.spec.name}: {outcome.message}")

@@ -5,8 +5,9 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from sb3_cpm.presets import nearest
 from sb3_cpm.run.evaluation import FIRST_SEED
 
 
@@ -159,22 +160,25 @@ class Experiment:
         seeds: int | None = None,
         steps: int | None = None,
         agents: Sequence[str] | None = None,
+        tasks: Sequence[str] | None = None,
     ) -> Iterator[RunSpec]:
         """
         :param quick: the version that takes minutes
         :param seeds: how many, from the plan's first; None: the plan's number
         :param steps: of each run; None: the plan's number
         :param agents: names of contenders; None: all
+        :param tasks: names of tasks; None: all
         :return: all runs, first seeds first
+        :raises ValueError: for a name that this experiment does not have, with the nearest
         """
         from sb3_cpm.zoo.agents import algorithm_of
 
         plan = self.plan(quick)
+        contenders = _chosen("agent", agents, self.contenders)
+        chosen_tasks = _chosen("task", tasks, plan.tasks)
         for seed in range(plan.first_seed, plan.first_seed + (plan.seeds if seeds is None else seeds)):
-            for task in plan.tasks:
-                for contender in self.contenders:
-                    if agents is not None and contender.name not in agents:
-                        continue
+            for task in chosen_tasks:
+                for contender in contenders:
                     yield RunSpec(
                         experiment=self.folder_name(quick),
                         agent=contender.name,
@@ -190,6 +194,19 @@ class Experiment:
                         eval_episodes=plan.eval_episodes,
                         eval_seed=plan.eval_seed,
                     )
+
+
+_Named = TypeVar("_Named", Contender, Task)
+
+
+def _chosen(kind: str, names: Sequence[str] | None, all_of_them: Sequence[_Named]) -> list[_Named]:
+    """Those with these names, in their own order; None: all."""
+    valid = [one.name for one in all_of_them]
+    for name in names or ():
+        if name not in valid:
+            hint = nearest(name, valid)
+            raise ValueError(f"There is no {kind} {name!r} in this experiment.{hint} Valid: {', '.join(valid)}.")
+    return [one for one in all_of_them if names is None or one.name in names]
 
 
 def _merged(*overrides: dict[str, Any]) -> dict[str, Any]:
