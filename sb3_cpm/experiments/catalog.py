@@ -117,9 +117,9 @@ _ALL = (
         "",
         "PointMaze_UMaze-v3 with sparse rewards",
         "not in the report: a sparse goal task where hindsight applies",
-        (SAC, CPM, HER),
+        (SAC, CPM, HER, PLAN2EXPLORE),
         "curves",
-        Plan((POINTMAZE,), 50_000, 5_000, 10, 5, cost="2 to 5 CPU minutes per run"),
+        Plan((POINTMAZE,), 50_000, 5_000, 10, 10, cost="2 to 5 CPU minutes per run"),
         Plan((POINTMAZE,), 4_000, 2_000, 3, 1, cost="1 minute on 2 cores"),
     ),
     Experiment(
