@@ -150,7 +150,8 @@ def draw(
     lines: dict[str, float] | None = None,
 ) -> None:
     """
-    One panel per environment, one line per agent with its confidence interval.
+    One panel per environment; one line per agent with its confidence interval, and a thin one per seed. The y axis has room
+    for every seed, not for the whole of an interval, which is very wide where two or three seeds differ.
 
     :param path: of the picture
     :param data: from :func:`curves`
@@ -161,6 +162,7 @@ def draw(
     """
     figure, axes = plt.subplots(1, len(envs), figsize=(4.6 * len(envs), 3.4), squeeze=False, layout="constrained")
     for axis, env in zip(axes[0], envs, strict=True):
+        low, high = np.inf, -np.inf
         for agent, name in names.items():
             steps = data.get((env, agent))
             if not steps:
@@ -169,12 +171,17 @@ def draw(
             half = np.array([interval(values) for values in steps.values()])
             n_seeds = max(len(values) for values in steps.values())
             (line,) = axis.plot(x, mean, label=f"{name} ({n_seeds} seeds)", linewidth=1.8)
-            axis.fill_between(x, mean - half, mean + half, alpha=0.2, color=line.get_color(), linewidth=0)
+            axis.fill_between(x, mean - half, mean + half, alpha=0.15, color=line.get_color(), linewidth=0)
+            for seed in range(n_seeds):
+                one = [values[seed] if seed < len(values) else np.nan for values in steps.values()]
+                axis.plot(x, one, color=line.get_color(), linewidth=0.7, alpha=0.6)
+            low, high = min(low, *(values.min() for values in steps.values())), max(high, *(v.max() for v in steps.values()))
         if lines and env in lines:
             axis.axhline(lines[env], color="grey", linestyle=":", linewidth=1)
         axis.set(title=env, xlabel="environment steps", ylabel=label)
+        axis.set_ylim(low - 0.08 * (high - low), high + 0.3 * (high - low))  # the legend's place is at the top
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8, frameon=False)
+        axis.legend(fontsize=8, frameon=False, loc="upper left")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
     plt.close(figure)
