@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.specification import Experiment
@@ -21,6 +22,7 @@ from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.run.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE
 
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
+LEGEND_COLUMNS = 4
 #: Columns of evaluations.csv with the words for them.
 SCORES = {
     "success_at_end": "success at the end of the episode",
@@ -185,16 +187,26 @@ def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFr
 
 
 def _finished(figure: Figure, grid: np.ndarray) -> Figure:
-    """With the name of the x axis, and one legend below that has every label once."""
+    """With the x axis' name and a few ticks, and one legend below that has every label once."""
     for axes in grid[-1]:
         axes.set_xlabel("environment steps")
+    for axes in grid.flat:
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     handles: dict[str, Artist] = {}
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 4), fontsize=9)
+        columns = min(len(handles), LEGEND_COLUMNS)
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=9)
     return figure
+
+
+def add_note(figure: Figure, text: str) -> None:
+    """Small print below everything else."""
+    rows = sum(-(-len(legend.get_texts()) // LEGEND_COLUMNS) for legend in figure.legends)
+    # the layout makes room for this and for the legend, but at the same place: the empty lines are the legend's
+    figure.supxlabel(text + (1 + 2 * rows) * "\n", fontsize=7, wrap=True)
 
 
 def _draw_curves(experiment: Experiment, data: Data) -> Figure:

@@ -104,13 +104,12 @@ def draw(
     :return: the figure, from the CSV files alone
     :raises ValueError: where there is no data, with the command that makes it
     """
-    from sb3_cpm.experiments.figures import draw_experiment
+    from sb3_cpm.experiments.figures import add_note, draw_experiment
 
     other = None if source is None else find_experiment(source)
     figure, notes = draw_experiment(find_experiment(name), results, quick, other, task)
     if notes:
-        # the layout makes room for this and for the legend, but at the same place: the empty lines are the legend's
-        figure.supxlabel("Note: " + "; ".join(notes) + 3 * "\n", fontsize=7, wrap=True)
+        add_note(figure, "Note: " + "; ".join(notes))
     return figure
 
 
