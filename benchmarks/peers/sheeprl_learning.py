@@ -56,7 +56,7 @@ class Player:
         inputs = {}
         for key, value in as_dict(observations).items():
             tensor = th.as_tensor(value).float()[None]
-            inputs[key] = tensor / 255 - 0.5 if key in self.peer.images else tensor
+            inputs[key] = tensor.permute(0, 1, 4, 2, 3) / 255 - 0.5 if key in self.peer.images else tensor
         return self.player.get_actions(inputs, greedy)[0][0].clamp(-1, 1).numpy()
 
 
