@@ -163,18 +163,19 @@ def draw(
     figure, axes = plt.subplots(1, len(envs), figsize=(4.6 * len(envs), 3.4), squeeze=False, layout="constrained")
     for axis, env in zip(axes[0], envs, strict=True):
         low, high = np.inf, -np.inf
-        for agent, name in names.items():
+        for index, (agent, name) in enumerate(names.items()):
             steps = data.get((env, agent))
             if not steps:
                 continue
             x, mean = list(steps), np.array([values.mean() for values in steps.values()])
             half = np.array([interval(values) for values in steps.values()])
             n_seeds = max(len(values) for values in steps.values())
-            (line,) = axis.plot(x, mean, label=f"{name} ({n_seeds} seeds)", linewidth=1.8)
-            axis.fill_between(x, mean - half, mean + half, alpha=0.15, color=line.get_color(), linewidth=0)
+            colour = f"C{index}"  # an agent's in all panels
+            axis.plot(x, mean, label=f"{name} ({n_seeds} seeds)", linewidth=1.8, color=colour)
+            axis.fill_between(x, mean - half, mean + half, alpha=0.15, color=colour, linewidth=0)
             for seed in range(n_seeds):
                 one = [values[seed] if seed < len(values) else np.nan for values in steps.values()]
-                axis.plot(x, one, color=line.get_color(), linewidth=0.7, alpha=0.6)
+                axis.plot(x, one, color=colour, linewidth=0.7, alpha=0.6)
             low, high = min(low, *(values.min() for values in steps.values())), max(high, *(v.max() for v in steps.values()))
         if lines and env in lines:
             axis.axhline(lines[env], color="grey", linestyle=":", linewidth=1)
