@@ -82,7 +82,7 @@ _ALL = (
         "not in the report: the same method where it is fast",
         (SAC, CPM, HER),
         "curves",
-        Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 17 CPU minutes per run"),
+        Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
     ),
     Experiment(
@@ -92,7 +92,7 @@ _ALL = (
         "not in the report: for choosing constants, on seeds and evaluation episodes that no other experiment uses",
         PARTS,
         "curves",
-        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 1, STATE, "5 to 9 CPU minutes per run", 100, 2_000_000),
+        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 1, STATE, "10 to 17 CPU minutes per run", 100, 2_000_000),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, "5 minutes on 2 cores", 100, 2_000_000),
     ),
     Experiment(
