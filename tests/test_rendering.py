@@ -60,7 +60,7 @@ def test_backports_from_the_old_format() -> None:
     [
         (DEB822, None),  # not Debian
         (DEB822, "trixie"),  # nothing to copy
-        (DEB822 + "\nTypes: deb\nURIs: http://m/debian\nSuites: bookworm-backports\nComponents: main\n", "bookworm"),
+        (DEB822 + "\nTypes: deb\nURIs: http://m/os\nSuites: bookworm-backports\nComponents: main\n", "bookworm"),
         (DEB822.replace("Types: deb\n#", "Types: deb\nEnabled: no\n#"), "bookworm"),
     ],
 )

@@ -57,7 +57,7 @@ DECAYS = tuple(
 #: What of the method helps or hurts where the report's constants do badly.
 PARTS = (
     SAC,
-    Contender("CPM-SAC", "cpm_sac"),
+    CPM,
     Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
     Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}}),
     Contender(
