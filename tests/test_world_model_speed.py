@@ -11,8 +11,11 @@ from torch import nn
 
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
+from sb3_cpm.world_model import activation, deconvolution
 from sb3_cpm.world_model import linear as linear_module
 from sb3_cpm.world_model.acceleration import cache_slices
+from sb3_cpm.world_model.activation import ELU, elu_
+from sb3_cpm.world_model.deconvolution import Drawing
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
 from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
 from sb3_cpm.world_model.losses import squared_error
@@ -106,7 +109,7 @@ def test_an_mlp_takes_any_batch_and_copies_no_gradient(batch: tuple[int, ...]) -
     assert result.shape == (*batch, 3)
     expected = inputs
     for layer in net:
-        expected = F.elu(expected) if isinstance(layer, nn.ELU) else F.linear(expected, layer.weight, layer.bias)
+        expected = F.elu(expected) if isinstance(layer, ELU) else F.linear(expected, layer.weight, layer.bias)
     assert_equal([result], [expected], 1e-5)
     names, waiting = set(), [result.grad_fn]
     while waiting:
@@ -236,6 +239,52 @@ def test_convolutions_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
         loss = (embed * torch.randn_like(embed)).sum() + (drawn * torch.randn_like(drawn)).sum()
         results.append([embed, drawn, *torch.autograd.grad(loss, [feat, images, *weights])])
     assert_equal(*results, 1e-5)
+
+
+# ---- activation ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(activation.SLICE,), (300, 500), (40, 32, 12, 8), (0, 4)])
+def test_elu_in_place_is_that_of_pytorch(shape: tuple[int, ...]) -> None:
+    (values,) = leaves(shape)
+    assert activation.is_faster(values.detach()) == (values.numel() > 0)
+    # times one: in place on a result, as after a layer
+    assert_equal(gradients(lambda x: elu_(x * 1.0), [values]), gradients(lambda x: F.elu(x * 1.0), [values]), 1e-6)
+    if len(shape) == 4:
+        images = values.detach().contiguous(memory_format=torch.channels_last)
+        expected, found = F.elu(images), elu_(images)
+        assert found is images and torch.allclose(found, expected, atol=1e-6)
+
+
+def test_elu_of_extreme_values_and_of_what_is_left_to_pytorch() -> None:
+    one = torch.tensor([0.0, -0.0, 100.0, -100.0, 1e-20, -1e-20, torch.inf, -torch.inf, torch.nan])
+    extremes = one.repeat(activation.SLICE)
+    expected = F.elu(extremes)
+    assert torch.allclose(elu_(extremes), expected, atol=1e-7, equal_nan=True)
+    many = torch.zeros(2 * activation.SLICE)
+    assert activation.is_faster(many)
+    assert not activation.is_faster(many.double()) and not activation.is_faster(many[: activation.SLICE - 1])
+    assert not activation.is_faster(many.bfloat16()) and not activation.is_faster(torch.zeros(2, activation.SLICE).t()[::2])
+
+
+# ---- deconvolution ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels, height, width", [(3, 4, 4), (6, 5, 3), (1, 1, 1)])
+def test_drawing_is_a_transposed_convolution(channels: int, height: int, width: int) -> None:
+    inputs = leaves((7, 8, height, width), (8, channels, 4, 4), (channels,))
+
+    def with_layer(layer: nn.ConvTranspose2d) -> Callable[..., torch.Tensor]:
+        # contiguous: random weights of the result are drawn in the order of its memory
+        return lambda x, weight, bias: torch.func.functional_call(layer, {"weight": weight, "bias": bias}, x).contiguous()
+
+    assert deconvolution.is_faster(inputs[0], channels)
+    found = gradients(with_layer(Drawing(8, channels)), inputs)
+    assert_equal(found, gradients(with_layer(nn.ConvTranspose2d(8, channels, 4, 2, 1)), inputs), 1e-5)
+    assert Drawing(8, channels)(inputs[0]).is_contiguous(memory_format=torch.channels_last)
+    assert not deconvolution.is_faster(inputs[0].double(), channels) and not deconvolution.is_faster(inputs[0], 64)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert Drawing(8, channels)(inputs[0]).dtype == torch.bfloat16
 
 
 # ---- ensemble --------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
 from sb3_cpm.world_model.acceleration import cache_slices
+from sb3_cpm.world_model.activation import elu_
 from sb3_cpm.world_model.linear import affine, is_large
 
 
@@ -49,7 +50,7 @@ class Ensemble(nn.Module):
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = torch.baddbmm(bias, hidden, weight)
             if layer < last:
-                hidden = F.elu(hidden, inplace=True)
+                hidden = elu_(hidden)
         return hidden
 
     def predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
@@ -66,7 +67,7 @@ class Ensemble(nn.Module):
             for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
                 hidden = affine(hidden, weight[head], bias[head][0])
                 if layer < last:
-                    hidden = F.elu(hidden, inplace=True)
+                    hidden = elu_(hidden)
             outputs.append(hidden)
         return outputs
 

@@ -5,9 +5,13 @@ Initial weights are torch's own. Glorot's, as in Dreamer's TensorFlow original, 
 slowly here: open-loop pixel error after 300 updates of a moving square 0.074 instead of 0.063.
 """
 
+from itertools import pairwise
+
 import torch
 from torch import nn
 
+from sb3_cpm.world_model.activation import ELU
+from sb3_cpm.world_model.deconvolution import Drawing
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
 
@@ -32,7 +36,7 @@ class MLP(nn.Sequential):
     def __init__(self, input_dim: int, layers: int, units: int, output_dim: int | None = None) -> None:
         modules: list[nn.Module] = []
         for _ in range(layers):
-            modules += [Linear(input_dim, units), nn.ELU(inplace=True)]
+            modules += [Linear(input_dim, units), ELU()]
             input_dim = units
         if output_dim is not None:
             modules.append(Linear(input_dim, output_dim))
@@ -124,7 +128,7 @@ class ConvEncoder(nn.Module):
         modules: list[nn.Module] = []
         for layer in range(layers):
             out = depth * min(2**layer, 8)
-            modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), nn.ELU(inplace=True)]
+            modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), ELU()]
             channels = out
         self.convolutions = channels_last(nn.Sequential(*modules))
         self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
@@ -152,9 +156,9 @@ class ConvDecoder(nn.Module):
         self.feature_map = (widths[0], height // 2**layers, width // 2**layers)
         self.linear = Linear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2])
         modules: list[nn.Module] = []
-        for narrow, wide in zip([*widths[1:], channels], widths, strict=True):
-            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), nn.ELU(inplace=True)]
-        self.convolutions = channels_last(nn.Sequential(*modules[:-1]))
+        for wide, narrow in pairwise(widths):
+            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), ELU()]
+        self.convolutions = channels_last(nn.Sequential(*modules, Drawing(widths[-1], channels)))
         self.largest = depth * height * width // 4
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:
