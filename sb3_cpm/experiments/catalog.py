@@ -54,12 +54,27 @@ DECAYS = tuple(
     Contender(f"CPM {name}", "cpm_sac", challenger(decay=name))
     for name in ("constant", "linear", "exponential", "inverse_time", "cosine", "logistic")
 )
+NO_CHALLENGES = Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}})
+#: A tenth of every batch from 100 challenges, whose rewards hardly differ from the task's.
+WEAK = Contender(
+    "CPM, weak challenges",
+    "cpm_sac",
+    {
+        "replay_buffer_kwargs": {
+            "challenge_ratio": 0.1,
+            "mix": "row",
+            "max_challenges": 100,
+            "reward_kwargs": {"exploration_ratio": 0.1, "scale": 0.86},
+        }
+    },
+)
 #: What of the method helps or hurts where the report's constants do badly.
 PARTS = (
     SAC,
     CPM,
     Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
-    Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}}),
+    NO_CHALLENGES,
+    WEAK,
     Contender(
         "CPM, task rewards",
         "cpm_sac",
@@ -92,7 +107,7 @@ _ALL = (
         "not in the report: for choosing constants, on seeds and evaluation episodes that no other experiment uses",
         PARTS,
         "curves",
-        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 1, STATE, "10 to 17 CPU minutes per run", 100, 2_000_000),
+        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 2, STATE, "10 to 17 CPU minutes per run", 100, 2_000_000),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, "5 minutes on 2 cores", 100, 2_000_000),
     ),
     Experiment(
@@ -111,6 +126,16 @@ _ALL = (
             cost="1 (SAC) to 2 CPU minutes per run",
         ),
         Plan((MOUNTAINCAR,), 4_000, 1_000, 3, 2, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "mountaincar-parts",
+        "",
+        "MountainCarContinuous-v0: parts of the method",
+        "not in the report: for choosing constants, on seeds and evaluation episodes that no other experiment uses",
+        (CPM, NO_CHALLENGES, WEAK),
+        "curves",
+        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 5, {}, "2 CPU minutes per run", 100, 2_000_000),
+        Plan((MOUNTAINCAR,), 2_000, 1_000, 3, 1, {}, "1 minute on 2 cores", 100, 2_000_000),
     ),
     Experiment(
         "pointmaze",
