@@ -41,6 +41,7 @@ def controller(mode: str) -> Task:
 SAC = Contender("SAC", "sac")
 HER = Contender("SAC+HER", "sac_her")
 CPM = Contender("CPM-SAC", "cpm_sac")
+CPM_HER = Contender("CPM-SAC+HER", "cpm_sac", {"replay_buffer_kwargs": {"n_sampled_goal": 4}})
 HIGH = Contender("CPM high exploration", "cpm_sac_high_exploration")
 SIMPLE = Contender("CPM simple", "cpm_sac")
 REPORT = Contender("CPM report", "cpm_sac_report")
@@ -142,7 +143,7 @@ _ALL = (
         "",
         "PointMaze_UMaze-v3 with sparse rewards",
         "not in the report: a sparse goal task where hindsight applies",
-        (SAC, CPM, HER, PLAN2EXPLORE),
+        (SAC, CPM, HER, CPM_HER, PLAN2EXPLORE),
         "curves",
         Plan((POINTMAZE,), 50_000, 5_000, 10, 10, cost="2 to 5 CPU minutes per run"),
         Plan((POINTMAZE,), 4_000, 2_000, 3, 1, cost="1 minute on 2 cores"),
