@@ -45,6 +45,25 @@ CPM_HER = Contender("CPM-SAC+HER", "cpm_sac", {"replay_buffer_kwargs": {"n_sampl
 HIGH = Contender("CPM high exploration", "cpm_sac_high_exploration")
 SIMPLE = Contender("CPM simple", "cpm_sac")
 REPORT = Contender("CPM report", "cpm_sac_report")
+#: What rl_zoo3 has found for SAC on MountainCarContinuous-v0, with state-dependent exploration and observations as they come.
+ZOO_SDE = Contender(
+    "SAC of rl_zoo3, gSDE",
+    "sac",
+    {
+        "env_wrapper": "sb3_cpm.zoo.wrappers.TerminationIsSuccess",
+        "policy_kwargs": {"log_std_init": -3.67, "net_arch": [64, 64]},
+        "use_sde": True,
+        "learning_rate": 3e-4,
+        "buffer_size": 50_000,
+        "learning_starts": 0,
+        "batch_size": 512,
+        "ent_coef": 0.1,
+        "gamma": 0.9999,
+        "tau": 0.01,
+        "train_freq": 32,
+        "gradient_steps": 32,
+    },
+)
 DREAMER = Contender("Dreamer", "dreamer")
 PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
 PPO_RGBD = Contender("PPO RGBD", "ppo_rgbd")
@@ -116,7 +135,7 @@ _ALL = (
         "",
         "MountainCarContinuous-v0: a reward that has to be found",
         "not in the report: hard exploration in minutes",
-        (SAC, CPM, PLAN2EXPLORE),
+        (SAC, CPM, PLAN2EXPLORE, ZOO_SDE),
         "curves",
         Plan(
             (MOUNTAINCAR,),
