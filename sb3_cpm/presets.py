@@ -1,5 +1,6 @@
 """
-Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; SPEC of the method in the documentation).
+Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; SPEC of the method in the documentation),
+and of what is made of its challenges (4.3 and B.6).
 
 ``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. ``"default"`` is
 small enough for two CPU cores: an update takes about 0.1 CPU seconds for vectors and 0.15 for two 32x32 cameras. ``"report"``
@@ -104,6 +105,24 @@ DEFAULT: dict[str, Any] = {
 }
 
 PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}
+
+#: Arguments of :class:`~sb3_cpm.buffers.CPMBuffer`: how challenges are used. "report" has its constants, which are the
+#: buffer's defaults, too. "tuned" makes less of challenges: on a dense reward those of the report slow the player down
+#: (docs/experiments.md says on which seeds that was found).
+CHALLENGES: dict[str, dict[str, Any]] = {
+    "report": {
+        "challenge_ratio": 0.25,  # share of I in what the player trains on
+        "mix": "batch",  # a whole batch from I now and then
+        "max_challenges": 10,  # size of I
+        "reward_kwargs": {"exploration_ratio": 1 / 1.5, "scale": 0.5},  # uncertainty is worth two thirds of the task reward
+    },
+    "tuned": {
+        "challenge_ratio": 0.1,
+        "mix": "row",  # a tenth of every batch: none consists of ten trajectories alone
+        "max_challenges": 100,
+        "reward_kwargs": {"exploration_ratio": 0.1, "scale": 0.86},  # mean(r') = 0.86 * (1 + 0.1 * 1.6) * mean(r) = mean(r)
+    },
+}
 
 _POSITIVE_INTEGERS = [
     key for key in REPORT if key.endswith(("_size", "_length", "_units", "_classes", "_every")) or key.startswith("cnn_")

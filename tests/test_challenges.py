@@ -1,5 +1,6 @@
 """The arithmetic of SPEC sections 3 to 6 against values worked out by hand, and what must hold for any input."""
 
+import inspect
 import pickle
 
 import numpy as np
@@ -7,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_cpm import CPMBuffer
 from sb3_cpm.challenges import ChallengeCurator, ChallengeFilter, ChallengeQuality, DynamicCoefficient
 from sb3_cpm.challenges.filters import CandidateStatistics, Tolerance
 from sb3_cpm.challenges.quality import best_goal
 from sb3_cpm.challenges.rewards import ArtificialReward, embedding_progress, step_progress
+from sb3_cpm.presets import CHALLENGES
 from sb3_cpm.type_aliases import Evaluation
 
 # ---------------------------------------------------------------------- targeting (Algorithm 2)
@@ -304,3 +307,19 @@ def test_a_broken_evaluation_is_refused_and_changes_nothing(broken):
     with pytest.raises(ValueError, match="20-step trajectory"):
         curator.propose(rewards, evaluation)
     assert pickle.dumps(curator) == before
+
+
+# ---------------------------------------------------------------------- presets
+
+
+def test_the_report_is_the_default_and_tuned_keeps_the_size_of_rewards():
+    of_buffer, of_rewards = (inspect.signature(kind).parameters for kind in (CPMBuffer, ArtificialReward))
+    for name, value in CHALLENGES["report"].items():
+        if name != "reward_kwargs":
+            assert of_buffer[name].default == value
+    for name, value in CHALLENGES["report"]["reward_kwargs"].items():
+        assert of_rewards[name].default == value
+    assert CHALLENGES["tuned"].keys() == CHALLENGES["report"].keys()
+
+    terms = 1.0 + CHALLENGES["tuned"]["reward_kwargs"]["exploration_ratio"] * (1.0 + 0.3 + 0.3)
+    assert CHALLENGES["tuned"]["reward_kwargs"]["scale"] * terms == pytest.approx(1.0, abs=0.01)

@@ -27,6 +27,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from sb3_cpm import ChallengerCallback, CPMBuffer
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
+from sb3_cpm.presets import CHALLENGES
 from sb3_cpm.zoo import ENV_IDS, TASKS, env_id_of, search
 from sb3_cpm.zoo.__main__ import complete, main
 from sb3_cpm.zoo.agents import config_folder, load_agent
@@ -73,7 +74,7 @@ def test_entries_have_only_keys_that_somebody_takes(name: str, env_id: str) -> N
 
 
 def test_every_file_has_the_seven_tasks_and_a_default() -> None:
-    assert len(CONFIGS) == 9
+    assert len(CONFIGS) == 10
     for path in CONFIGS:
         assert {"default", *(env_id_of(task) for task in TASKS)} <= set(read_entries(path)), path
 
@@ -89,6 +90,14 @@ def test_agents_that_are_compared_differ_in_what_is_compared() -> None:
             same = set(entry) - {"callback", "replay_buffer_class", "replay_buffer_kwargs", "env_wrapper", "policy"}
             assert {key: entry[key] for key in same} == {key: plain[env_id][key] for key in same}, env_id
     assert cpm["CPM/PickCube-v1"]["policy"] == plain["CPM/PickCube-v1"]["policy"] == "sb3_cpm.PointNetPolicy"
+
+
+def test_tuned_differs_in_its_challenges_only() -> None:
+    simple, tuned = (read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_tuned"))
+    assert set(tuned) == {*simple, ".challenges"}
+    for env_id, entry in simple.items():
+        expected = {**entry, "replay_buffer_kwargs": {**entry["replay_buffer_kwargs"], **CHALLENGES["tuned"]}}
+        assert tuned[env_id] == expected, env_id
 
 
 def test_report_has_the_constants_of_the_report() -> None:

@@ -8,6 +8,7 @@ like the robot tasks but needs no renderer: they show that everything works and 
 from typing import Any
 
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, Task
+from sb3_cpm.presets import CHALLENGES
 from sb3_cpm.zoo.agents import nearest
 
 
@@ -45,6 +46,7 @@ CPM_HER = Contender("CPM-SAC+HER", "cpm_sac", {"replay_buffer_kwargs": {"n_sampl
 HIGH = Contender("CPM high exploration", "cpm_sac_high_exploration")
 SIMPLE = Contender("CPM simple", "cpm_sac")
 REPORT = Contender("CPM report", "cpm_sac_report")
+TUNED = Contender("CPM tuned", "cpm_sac_tuned")
 #: What rl_zoo3 has found for SAC on MountainCarContinuous-v0, with state-dependent exploration and observations as they come.
 ZOO_SDE = Contender(
     "SAC of rl_zoo3, gSDE",
@@ -75,19 +77,7 @@ DECAYS = tuple(
     for name in ("constant", "linear", "exponential", "inverse_time", "cosine", "logistic")
 )
 NO_CHALLENGES = Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}})
-#: A tenth of every batch from 100 challenges, whose rewards hardly differ from the task's.
-WEAK = Contender(
-    "CPM, weak challenges",
-    "cpm_sac",
-    {
-        "replay_buffer_kwargs": {
-            "challenge_ratio": 0.1,
-            "mix": "row",
-            "max_challenges": 100,
-            "reward_kwargs": {"exploration_ratio": 0.1, "scale": 0.86},
-        }
-    },
-)
+WEAK = Contender("CPM, weak challenges", "cpm_sac", {"replay_buffer_kwargs": CHALLENGES["tuned"]})
 #: What of the method helps or hurts where the report's constants do badly.
 PARTS = (
     SAC,
@@ -115,7 +105,7 @@ _ALL = (
         "",
         "PickCube-v1 from state vectors",
         "not in the report: the same method where it is fast",
-        (SAC, CPM, HER),
+        (SAC, CPM, TUNED, HER),
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
@@ -135,7 +125,7 @@ _ALL = (
         "",
         "MountainCarContinuous-v0: a reward that has to be found",
         "not in the report: hard exploration in minutes",
-        (SAC, CPM, PLAN2EXPLORE, ZOO_SDE),
+        (SAC, CPM, TUNED, PLAN2EXPLORE, ZOO_SDE),
         "curves",
         Plan(
             (MOUNTAINCAR,),
