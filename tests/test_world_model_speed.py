@@ -82,7 +82,9 @@ def test_everything_else_is_left_to_pytorch() -> None:
 @pytest.mark.parametrize("vendor, faster", [("AuthenticAMD", True), ("GenuineIntel", False), ("", False)])
 def test_the_processor_decides(vendor: str, faster: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear_module, "processor", lambda: f"vendor_id : {vendor}")
+    monkeypatch.setattr(activation, "processor", linear_module.processor)
     assert linear_module.prefers_onednn.__wrapped__() == (faster and linear_module.onednn_works())
+    assert activation.has_fast_exp.__wrapped__() == (not faster)
 
 
 def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch, small_products: None) -> None:
@@ -244,8 +246,14 @@ def test_convolutions_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- activation ------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def fast_exp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ELU by exp on any processor."""
+    monkeypatch.setattr(activation, "has_fast_exp", lambda: True)
+
+
 @pytest.mark.parametrize("shape", [(activation.SLICE,), (300, 500), (40, 32, 12, 8), (0, 4)])
-def test_elu_in_place_is_that_of_pytorch(shape: tuple[int, ...]) -> None:
+def test_elu_in_place_is_that_of_pytorch(shape: tuple[int, ...], fast_exp: None) -> None:
     (values,) = leaves(shape)
     assert activation.is_faster(values.detach()) == (values.numel() > 0)
     # times one: in place on a result, as after a layer
@@ -256,7 +264,7 @@ def test_elu_in_place_is_that_of_pytorch(shape: tuple[int, ...]) -> None:
         assert found is images and torch.allclose(found, expected, atol=1e-6)
 
 
-def test_elu_of_extreme_values_and_of_what_is_left_to_pytorch() -> None:
+def test_elu_of_extreme_values_and_of_what_is_left_to_pytorch(fast_exp: None) -> None:
     one = torch.tensor([0.0, -0.0, 100.0, -100.0, 1e-20, -1e-20, torch.inf, -torch.inf, torch.nan])
     extremes = one.repeat(activation.SLICE)
     expected = F.elu(extremes)
