@@ -117,7 +117,7 @@ _ALL = (
         "not in the report: for choosing constants, on seeds and evaluation episodes that no other experiment uses",
         PARTS,
         "curves",
-        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 2, STATE, "10 to 17 CPU minutes per run", 100, 2_000_000),
+        Plan(CONTROLLERS[:1], 40_000, 10_000, 10, 2, STATE, "10 to 24 CPU minutes per run, by processor", 100, 2_000_000),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, "5 minutes on 2 cores", 100, 2_000_000),
     ),
     Experiment(
@@ -133,7 +133,7 @@ _ALL = (
             2_000,
             5,
             10,
-            cost="1 (SAC) to 2 CPU minutes per run",
+            cost="1 (SAC) to 4 CPU minutes per run, by processor",
         ),
         Plan((MOUNTAINCAR,), 4_000, 1_000, 3, 2, cost="2 minutes on 2 cores"),
     ),
@@ -154,7 +154,7 @@ _ALL = (
         "not in the report: a sparse goal task where hindsight applies",
         (SAC, CPM, HER, CPM_HER, PLAN2EXPLORE),
         "curves",
-        Plan((POINTMAZE,), 50_000, 5_000, 10, 10, cost="2 to 5 CPU minutes per run"),
+        Plan((POINTMAZE,), 50_000, 5_000, 10, 10, cost="5 to 10 CPU minutes per run"),
         Plan((POINTMAZE,), 4_000, 2_000, 3, 1, cost="1 minute on 2 cores"),
     ),
     Experiment(
