@@ -27,6 +27,19 @@ def mixed_precision(device: torch.device, enabled: bool) -> AbstractContextManag
     return torch.autocast(device.type, dtype=torch.bfloat16) if enabled else contextlib.nullcontext()
 
 
+def is_plain(tensor: torch.Tensor) -> bool:
+    """
+    Whether a tensor lies on a CPU in float32, and neither mixed precision nor ``torch.compile`` is at work: what is computed
+    by hand for speed is made for that.
+    """
+    return (
+        tensor.device.type == "cpu"
+        and tensor.dtype == torch.float32
+        and not torch.is_autocast_enabled("cpu")
+        and not torch.compiler.is_compiling()
+    )
+
+
 def cache_slices(*tensors: torch.Tensor, rows: int = 64) -> Iterator[tuple[torch.Tensor, ...]]:
     """
     The same rows of all tensors, on a CPU so few that several operations on them stay in its caches; on a GPU all at once.

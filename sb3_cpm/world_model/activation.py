@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from sb3_cpm.world_model.acceleration import is_plain
 from sb3_cpm.world_model.linear import processor
 
 SLICE = 2**16  # numbers that several operations find in the cache; with fewer in all, calling costs more
@@ -39,13 +40,11 @@ def elu_(values: torch.Tensor) -> torch.Tensor:
 
 
 def is_faster(values: torch.Tensor) -> bool:
-    """Whether values are many, lie on a CPU without gaps, and are in plain float32."""
+    """Whether values are many, lie in memory without gaps, and are plain."""
     return (
-        values.device.type == "cpu"
-        and values.dtype == torch.float32
-        and values.numel() >= SLICE
+        values.numel() >= SLICE
         and (values.is_contiguous() or values.is_contiguous(memory_format=torch.channels_last))
-        and not torch.compiler.is_compiling()
+        and is_plain(values)
         and has_fast_exp()
     )
 

@@ -14,6 +14,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from sb3_cpm.world_model.acceleration import is_plain
+
 MAX_CHANNELS = 16  # of the output
 #: Taps of the kernel that read the input pixel before and at (even rows or columns), at and behind (odd ones).
 TAPS = ((3, 1), (2, 0))
@@ -37,15 +39,8 @@ class Drawing(nn.ConvTranspose2d):
 
 
 def is_faster(inputs: torch.Tensor, out_channels: int) -> bool:
-    """Whether inputs lie on a CPU in plain float32, and the output has few channels."""
-    return (
-        inputs.device.type == "cpu"
-        and inputs.dtype == torch.float32
-        and inputs.dim() == 4
-        and out_channels <= MAX_CHANNELS
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
-    )
+    """Whether inputs are plain images, and the output has few channels."""
+    return inputs.dim() == 4 and out_channels <= MAX_CHANNELS and is_plain(inputs)
 
 
 class _Drawing(torch.autograd.Function):

@@ -22,6 +22,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from sb3_cpm.world_model.acceleration import is_plain
+
 MIN_ROWS, MIN_MULTIPLICATIONS = 64, 2**22  # below, calling costs more than multiplying
 
 
@@ -69,12 +71,7 @@ def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
 def is_large(inputs: torch.Tensor, size_out: int) -> bool:
     """Whether the product of such inputs with a matrix of ``size_out`` rows keeps a CPU busy, in plain float32."""
     return (
-        inputs.device.type == "cpu"
-        and inputs.dtype == torch.float32
-        and inputs.numel() >= MIN_ROWS * inputs.shape[-1]
-        and inputs.numel() * size_out >= MIN_MULTIPLICATIONS
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
+        inputs.numel() >= MIN_ROWS * inputs.shape[-1] and inputs.numel() * size_out >= MIN_MULTIPLICATIONS and is_plain(inputs)
     )
 
 
