@@ -59,7 +59,7 @@ class _ELU(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: torch.Tensor) -> torch.Tensor:
         in_memory = values if values.is_contiguous() else values.permute(0, 2, 3, 1)
-        exponential = torch.empty(SLICE)
+        exponential = values.new_empty(SLICE)
         for part in in_memory.view(-1).split(SLICE):
             below = torch.exp(part, out=exponential[: len(part)]).clamp_(max=1.0).sub_(1.0)
             torch.maximum(part, below, out=part)

@@ -49,7 +49,7 @@ class _Drawing(torch.autograd.Function):
         ctx.save_for_backward(inputs, weight)
         n, _, height, width = inputs.shape
         channels = len(bias)
-        taps = torch.tensor(TAPS)
+        taps = torch.tensor(TAPS, device=weight.device)
         # (in, out, row parity, tap of the row, column parity, tap of the column), parities side by side as channels
         kernel = weight[:, :, taps][..., taps].permute(2, 4, 1, 0, 3, 5).flatten(0, 2)
         kernel = kernel.contiguous(memory_format=torch.channels_last)
