@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
-from sb3_cpm.world_model import activation, deconvolution
+from sb3_cpm.world_model import acceleration, activation, deconvolution
 from sb3_cpm.world_model import linear as linear_module
 from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.activation import ELU, elu_
@@ -81,10 +81,11 @@ def test_everything_else_is_left_to_pytorch() -> None:
 
 @pytest.mark.parametrize("vendor, faster", [("AuthenticAMD", True), ("GenuineIntel", False), ("", False)])
 def test_the_processor_decides(vendor: str, faster: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linear_module, "processor", lambda: f"vendor_id : {vendor}")
-    monkeypatch.setattr(activation, "processor", linear_module.processor)
+    monkeypatch.setattr(acceleration, "processor", lambda: f"vendor_id : {vendor}")
+    for module in (linear_module, activation):
+        monkeypatch.setattr(module, "is_amd", acceleration.is_amd.__wrapped__)
     assert linear_module.prefers_onednn.__wrapped__() == (faster and linear_module.onednn_works())
-    assert activation.has_fast_exp.__wrapped__() == (not faster)
+    assert activation.is_faster(torch.zeros(activation.SLICE)) == (not faster)
 
 
 def test_without_the_operator_the_same_is_computed(monkeypatch: pytest.MonkeyPatch, small_products: None) -> None:
@@ -249,7 +250,7 @@ def test_convolutions_in_slices(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def fast_exp(monkeypatch: pytest.MonkeyPatch) -> None:
     """ELU by exp on any processor."""
-    monkeypatch.setattr(activation, "has_fast_exp", lambda: True)
+    monkeypatch.setattr(activation, "is_amd", lambda: False)
 
 
 @pytest.mark.parametrize("shape", [(activation.SLICE,), (300, 500), (40, 32, 12, 8), (0, 4)])

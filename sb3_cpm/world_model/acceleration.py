@@ -9,9 +9,11 @@ Acting and judging episodes stay in float32 as well; they cost little, and their
 
 import contextlib
 import functools
+import platform
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 import torch
 from torch import nn
@@ -38,6 +40,20 @@ def is_plain(tensor: torch.Tensor) -> bool:
         and not torch.is_autocast_enabled("cpu")
         and not torch.compiler.is_compiling()
     )
+
+
+@functools.cache
+def is_amd() -> bool:
+    """Whether this process has a processor of AMD's, on which MKL is not at its best."""
+    return "AuthenticAMD" in processor()
+
+
+def processor() -> str:
+    """What the operating system says of the processor, its vendor included."""
+    try:
+        return Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # not Linux
+        return platform.processor()
 
 
 def cache_slices(*tensors: torch.Tensor, rows: int = 64) -> Iterator[tuple[torch.Tensor, ...]]:

@@ -6,7 +6,6 @@ right to the last bit or two of 1. The four operations run on slices that stay i
 Measured on Intel's processors; on AMD's, where ``exp`` is MKL's too and may be slow, PyTorch's ELU stays.
 """
 
-import functools
 from typing import Any
 
 import torch
@@ -14,8 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import is_plain
-from sb3_cpm.world_model.linear import processor
+from sb3_cpm.world_model.acceleration import is_amd, is_plain
 
 SLICE = 2**16  # numbers that several operations find in the cache; with fewer in all, calling costs more
 
@@ -40,19 +38,13 @@ def elu_(values: torch.Tensor) -> torch.Tensor:
 
 
 def is_faster(values: torch.Tensor) -> bool:
-    """Whether values are many, lie in memory without gaps, and are plain."""
+    """Whether values are many, lie in memory without gaps, and are plain, on a processor where it has been measured."""
     return (
         values.numel() >= SLICE
         and (values.is_contiguous() or values.is_contiguous(memory_format=torch.channels_last))
         and is_plain(values)
-        and has_fast_exp()
+        and not is_amd()
     )
-
-
-@functools.cache
-def has_fast_exp() -> bool:
-    """Whether this processor is not one of those on which it has not been measured."""
-    return "AuthenticAMD" not in processor()
 
 
 class _ELU(torch.autograd.Function):

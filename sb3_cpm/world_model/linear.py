@@ -11,10 +11,8 @@ small matrices), everything is PyTorch's own.
 """
 
 import functools
-import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +20,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import is_plain
+from sb3_cpm.world_model.acceleration import is_amd, is_plain
 
 MIN_ROWS, MIN_MULTIPLICATIONS = 64, 2**22  # below, calling costs more than multiplying
 
@@ -78,15 +76,7 @@ def is_large(inputs: torch.Tensor, size_out: int) -> bool:
 @functools.cache
 def prefers_onednn() -> bool:
     """Whether this process has a processor that is faster with oneDNN, and an oneDNN that works."""
-    return "AuthenticAMD" in processor() and onednn_works()
-
-
-def processor() -> str:
-    """What the operating system says of the processor, its vendor included."""
-    try:
-        return Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # not Linux
-        return platform.processor()
+    return is_amd() and onednn_works()
 
 
 @functools.cache
