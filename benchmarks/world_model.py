@@ -7,7 +7,11 @@ other, and its share of a run.
     pip install -c constraints.txt -e ".[run,maniskill]" sheeprl==0.8.4     # the peer; rows run without it, too
     OMP_NUM_THREADS=1 python benchmarks/world_model.py                      # all rows, 15 minutes
     OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 behavior --threads 1 --repeats 7
-    python benchmarks/world_model.py --device cuda                          # also with bfloat16 and torch.compile
+    python benchmarks/world_model.py --device cuda                          # also with `compile` and bfloat16, 3 minutes
+
+sheeprl's own compiler needs more than four minutes for sequences of 50 steps, so that on a GPU ours with ``compile`` meets its
+plain code, unless ``--compile-peer`` is given (with ``--length 10`` it takes less). Without ManiSkill (which GPU machines may
+lack) a step of the simulator counts as 13 ms and the whole run is that of a task of PickCube's sizes that costs nothing.
 
 On a busy machine set ``OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=0``: two threads that wait by spinning take it from each other.
 
@@ -26,12 +30,14 @@ import importlib.util
 import platform
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+import gymnasium
 import numpy as np
 import torch
 from clock import Clock, Enough, Lap, clocked, median, timed
@@ -42,6 +48,7 @@ from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 
 ACTION_DIM, STATE_DIM = 7, 29
+STEP_SECONDS = 0.013  # of PickCube-v1 with light rendering on one core
 PEER = importlib.util.find_spec("sheeprl") is not None
 #: DreamerV2's latents, everything else as in the report; 3 convolutions make 4x4 feature maps of 32x32 images
 CATEGORICAL: dict[str, Any] = {"latent": "categorical", "stoch_size": 32, "stoch_classes": 32}
@@ -53,12 +60,16 @@ class Options(NamedTuple):
     :param threads: numbers of torch threads
     :param device: of the challenger and its peer
     :param steps: of each run of the player
+    :param length: of sequences
+    :param compile_peer: also its losses
     """
 
     repeats: int
     threads: list[int]
     device: str
     steps: int
+    length: int = 50
+    compile_peer: bool = False
 
 
 class Pair(NamedTuple):
@@ -173,11 +184,36 @@ def print_sizes(what: str, ours: dict[str, int], peer: Any) -> None:
             raise RuntimeError(f"{name}: {ours[name]:,} parameters against {number:,}")
 
 
-def variants(options: Options) -> Iterator[tuple[str, dict[str, bool]]]:
-    """Name and preset entries of what is measured: on GPUs also the fast switches."""
-    yield "", {}
+class Variant(NamedTuple):
+    """
+    :param name: of the row
+    :param switches: preset entries
+    :param other: arguments of the peer
+    """
+
+    name: str
+    switches: dict[str, bool]
+    other: dict[str, Any]
+
+    def target(self, options: Options, on_cpu: float) -> float | None:
+        """On a GPU three times, but only with the switches that are meant for it."""
+        return on_cpu if options.device == "cpu" else 3.0 if self.switches else None
+
+
+def variants(options: Options) -> Iterator[Variant]:
+    """What is measured: on GPUs also with the switches for speed."""
+    common: dict[str, Any] = {"device": options.device}
+    yield Variant("", {}, common)
     if options.device != "cpu":
-        yield ", bf16 + compile", {"amp": True, "compile": True}
+        compiled = common | {"compiled": options.compile_peer}
+        yield Variant(", compile", {"compile": True}, compiled)
+        yield Variant(", bf16 + compile", {"amp": True, "compile": True}, compiled | {"amp": True})
+
+
+def warm_up(ours: "Ours", batch: SequenceBatch, phases: int | None = None) -> None:
+    """CUDA graphs are recorded at the third call."""
+    for _ in range(3 if ours.challenger.compiled else 0):
+        ours.train(batch, phases)
 
 
 def take_turns(
@@ -211,24 +247,25 @@ def measure_dreamer(options: Options, size: int, cameras: int, target: float, be
     """World model, and with ``behavior`` imagination with actor and critic."""
     pairs = []
     space = make_space(size, cameras)
-    for name, switches in variants(options):
-        preset = make_preset("report", **CATEGORICAL, **switches, cnn_layers=3 if size == 32 else 4)
+    for variant in variants(options):
+        layers = {"cnn_layers": 3 if size == 32 else 4, "sequence_length": options.length}
+        preset = make_preset("report", **CATEGORICAL, **variant.switches, **layers)
         preset |= {"train_task_behavior": True, "train_exploration_behavior": False}
         ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
-        fast = {"amp": bool(switches), "compiled": bool(switches), "device": options.device}
-        peer = make_peer(preset, space, own_convolutions=own, **fast)
+        peer = make_peer(preset, space, own_convolutions=own, **variant.other)
         if not own:
             print_sizes(f"{size}x{size}x{3 * cameras}", ours.parameters(), peer)
         phases = None if behavior else 1
+        warm_up(ours, batch, phases)
         turns = take_turns(options, partial(ours.train, batch, phases), peer and partial(peer.train, batch, phases))
         convolutions = ", sheeprl's own convolutions" if own else ""
-        target = target if options.device == "cpu" else 3.0
         for threads, mine, others in turns:
-            what = f"world model, {size}x{size}x{3 * cameras} + state{convolutions}{name}"
-            pairs.append(Pair(what, total(mine, 0, 1), total(others, 0, 1), None if own else target, threads=threads))
+            what = f"world model, {size}x{size}x{3 * cameras} + state{convolutions}{variant.name}"
+            goal = None if own else variant.target(options, target)
+            pairs.append(Pair(what, total(mine, 0, 1), total(others, 0, 1), goal, threads=threads))
             if behavior:
-                what = f"imagination + actor-critic, 15 steps from 800 states{name}"
-                goal = 1.4 if options.device == "cpu" else 3.0
+                what = f"imagination + actor-critic, 15 steps from {16 * options.length} states{variant.name}"
+                goal = variant.target(options, 1.4)
                 pairs.append(Pair(what, total(mine, 1), total(others, 1), goal, threads=threads))
     return pairs
 
@@ -251,16 +288,16 @@ def measure_ensemble(options: Options) -> list[Pair]:
     pairs = []
     space = make_space(32, 2)
     heads = {"plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "stoch", "metric": "exp"}}
-    for name, switches in variants(options):
-        preset = make_preset("report", **CATEGORICAL, **switches, cnn_layers=3, uncertainty=heads)
+    for variant in variants(options):
+        preset = make_preset("report", **CATEGORICAL, **variant.switches, cnn_layers=3, uncertainty=heads)
         ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
-        peer = make_peer(preset, space, ensemble=True, device=options.device, amp=bool(switches))
+        peer = make_peer(preset, space, ensemble=True, **variant.other)
         print_sizes("ensemble", ours.parameters(), peer)
+        warm_up(ours, batch, 3)
         turns = take_turns(options, partial(ours.train, batch, 3), peer and partial(peer.train, batch, 2))
         for threads, mine, others in turns:
-            what = f"ensemble, 10 x (4 x 400){name}"
-            target = 1.4 if options.device == "cpu" else 3.0
-            pairs.append(Pair(what, total(mine, 1, 3), total(others, 1, 2), target, threads=threads))
+            what = f"ensemble, 10 x (4 x 400){variant.name}"
+            pairs.append(Pair(what, total(mine, 1, 3), total(others, 1, 2), variant.target(options, 1.4), threads=threads))
     return pairs
 
 
@@ -269,37 +306,75 @@ def measure_latents(options: Options) -> list[Pair]:
     The whole update (world model, ensemble, explorer): the report's Gaussian latents beside our categorical ones.
 
     At full speed of both the ratio is that of their operations, 1.9: most are those of the ten heads, whose middle layers do
-    not depend on the latent. The target dates from categorical latents that lost time elsewhere.
+    not depend on the latent. The target dates from categorical latents that lost time elsewhere. On a GPU both take as many
+    launches, and the ratio informs.
     """
     pairs = []
     space = make_space(32, 2)
-    for name, switches in variants(options):
+    for name, switches, _ in variants(options):
         gaussian, categorical = make_preset("report", **switches), make_preset("report", **CATEGORICAL, **switches)
         ours, other = Ours(space, gaussian, options.device), Ours(space, categorical, options.device)
         batch = make_batch(space, gaussian)
+        for one in (ours, other):
+            warm_up(one, batch)
+        target = 2.5 if options.device == "cpu" else None
         for threads, mine, others in take_turns(options, partial(ours.train, batch), partial(other.train, batch)):
             what = f"full update, Gaussian latents against categorical{name}"
-            pairs.append(Pair(what, total(mine, 0), total(others, 0), 2.5, threads=threads))
+            pairs.append(Pair(what, total(mine, 0), total(others, 0), target, threads=threads))
     return pairs
+
+
+class Episode(NamedTuple):
+    """
+    :param observation_space: of PickCube-v1 with two cameras
+    :param action_space: of it
+    :param states: of one episode
+    :param simulate: goes through the episode
+    :param close: to be called in the end
+    """
+
+    observation_space: spaces.Dict
+    action_space: spaces.Box
+    states: list[dict[str, np.ndarray]]
+    simulate: Callable[[], None]
+    close: Callable[[], None]
+
+
+def make_episode(actions: np.ndarray) -> Episode:
+    """In the simulator, and without ManiSkill of noise and as slow as the simulator is."""
+    if importlib.util.find_spec("mani_skill") is None:
+        space = make_space(32, 2)
+        space.seed(0)
+        states = [space.sample() for _ in range(len(actions) + 1)]
+        wait = partial(keep_busy, len(actions) * STEP_SECONDS)
+        return Episode(space, spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32), states, wait, lambda: None)
+    from sb3_cpm.envs import make_maniskill_env
+
+    env = make_maniskill_env("PickCube-v1")
+    states = []
+
+    def simulate() -> None:
+        states[:] = [env.reset(seed=0)[0]]
+        states.extend(env.step(action)[0] for action in actions)
+
+    assert isinstance(env.observation_space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
+    return Episode(env.observation_space, env.action_space, states, simulate, env.close)
+
+
+def keep_busy(seconds: float) -> None:
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        pass
 
 
 def measure_acting(options: Options) -> list[Pair]:
     """C's share of a step, and what it takes to judge an episode, beside the simulator's steps with light rendering."""
-    from sb3_cpm.envs import make_maniskill_env
-
     torch.set_num_threads(1)
-    env = make_maniskill_env("PickCube-v1")
-    space, n_steps = env.observation_space, 50
-    assert isinstance(space, spaces.Dict) and isinstance(env.action_space, spaces.Box)
+    n_steps = 50
     actions = np.random.default_rng(0).uniform(-1, 1, (n_steps, ACTION_DIM)).astype(np.float32)
-    episode: list[dict[str, np.ndarray]] = []
-
-    def simulate() -> None:
-        episode[:] = [env.reset(seed=0)[0]]
-        episode.extend(env.step(action)[0] for action in actions)
-
+    space, action_space, episode, simulate, close = make_episode(actions)
     laps: dict[str, list[Lap]] = {}
-    challengers = {preset: Challenger(space, env.action_space, options.device, preset) for preset in ("default", "report")}
+    challengers = {preset: Challenger(space, action_space, options.device, preset) for preset in ("default", "report")}
     for turn in range(options.repeats + 1):
         found = {"simulate": timed(simulate)}
         for preset, challenger in challengers.items():
@@ -310,7 +385,7 @@ def measure_acting(options: Options) -> list[Pair]:
                 found[f"{preset} act {n}"] = timed(act, options.device)
         for key, lap in found.items() if turn else ():
             laps.setdefault(key, []).append(lap)
-    env.close()
+    close()
     step = [Lap(cpu / n_steps, wall / n_steps) for cpu, wall in laps["simulate"]]
     pairs = []
     for preset in challengers:
@@ -339,26 +414,60 @@ def _acting(challenger: Challenger, arrays: dict[str, np.ndarray], actions: np.n
     return run
 
 
+class Vectors(gymnasium.Env):
+    """PickCube's state vector and actions without a simulation: what a run costs beside it."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (42,), np.float32)})
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._state(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self._state(), float(action[0]), False, self.steps == 50, {}
+
+    def _state(self) -> dict[str, np.ndarray]:
+        return {"state": self.np_random.normal(size=42).astype(np.float32)}
+
+
+def make_run_env() -> tuple[str, gymnasium.Env]:
+    """Name and environment of the row that measures whole runs."""
+    if importlib.util.find_spec("mani_skill") is None:
+        return "vectors without a simulation", Vectors()
+    from sb3_cpm.envs import make_maniskill_env
+
+    return "PickCube-v1 state", make_maniskill_env("PickCube-v1", obs_mode="state")
+
+
 def measure_run(options: Options) -> list[Pair]:
     """PickCube-v1 on state vectors: SAC with SB3's own settings, an update per step, and the same with a challenger."""
     from stable_baselines3 import SAC
 
     from sb3_cpm import ChallengerCallback, CPMBuffer
-    from sb3_cpm.envs import make_maniskill_env
 
     torch.set_num_threads(1)
-    laps: dict[bool, list[Lap]] = {True: [], False: []}
-    for turn in range(options.repeats + 1):
-        for cpm, found in laps.items():
-            env = make_maniskill_env("PickCube-v1", obs_mode="state")
-            kwargs: dict[str, Any] = {"replay_buffer_class": CPMBuffer} if cpm else {}
-            model = SAC("MultiInputPolicy", env, learning_starts=100, seed=turn, device=options.device, **kwargs)
-            steps, callback = options.steps if turn else 150, ChallengerCallback() if cpm else None
-            lap = timed(partial(model.learn, steps, callback=callback), options.device)
-            found.extend([Lap(lap.cpu / steps, lap.wall / steps)] if turn else [])
-            env.close()
-    what = f"a step of CPM-SAC, PickCube-v1 state, {options.steps} steps and updates, against SAC"
-    return [Pair(what, laps[True], laps[False], 1.5, at_most=True)]
+    pairs = []
+    for name, switches, _ in list(variants(options))[:2]:
+        laps: dict[bool, list[Lap]] = {True: [], False: []}
+        for turn in range(options.repeats + 1):
+            for cpm, found in laps.items():
+                task, env = make_run_env()
+                kwargs: dict[str, Any] = {"replay_buffer_class": CPMBuffer} if cpm else {}
+                model = SAC("MultiInputPolicy", env, learning_starts=100, seed=turn, device=options.device, **kwargs)
+                steps = options.steps if turn else 150
+                callback = ChallengerCallback(challenger_kwargs=switches) if cpm else None
+                lap = timed(partial(model.learn, steps, callback=callback), options.device)
+                found.extend([Lap(lap.cpu / steps, lap.wall / steps)] if turn else [])
+                env.close()
+        what = f"a step of CPM-SAC, {task}, {options.steps} steps and updates, against SAC{name}"
+        target = 1.5 if task.startswith("PickCube") else None
+        pairs.append(Pair(what, laps[True], laps[False], target, at_most=True))
+    return pairs
 
 
 ROWS: dict[str, Callable[[Options], list[Pair]]] = {
@@ -413,9 +522,11 @@ def main() -> int:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of torch threads")
     parser.add_argument("--steps", type=int, default=500, help="environment steps of each turn of a run")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--length", type=int, default=50, help="of the sequences in the rows of the world model")
+    parser.add_argument("--compile-peer", action="store_true", help="let sheeprl compile, too")
     arguments = parser.parse_args()
     threads = arguments.threads if arguments.device == "cpu" else [1]
-    options = Options(arguments.repeats, threads, arguments.device, arguments.steps)
+    options = Options(arguments.repeats, threads, arguments.device, arguments.steps, arguments.length, arguments.compile_peer)
     torch.set_float32_matmul_precision("high")  # sheeprl's default, for both
 
     peer = f"sheeprl {importlib.metadata.version('sheeprl')}" if PEER else "sheeprl is not installed (see --help)"

@@ -8,7 +8,8 @@ come from torch's global generator, so that one seed rules the run.
 import copy
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,11 @@ from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.uncertainty.ensemble import Ensemble
 from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
-from sb3_cpm.world_model.behavior import ActorCritic, Imagination
+from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Gradients, Imagination
 from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, read_file, write_file
+from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 from sb3_cpm.world_model.networks import MLP
-from sb3_cpm.world_model.observations import UINT8_RANGE, ObservationSpec, check_action_space, to_tensor
+from sb3_cpm.world_model.observations import UINT8_RANGE, Inputs, ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.open_loop import OpenLoop, open_loop
 from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
@@ -87,8 +89,15 @@ class Challenger:
         self.optimizers = self._make_optimizers()
         if self.preset["amp"]:
             check_mixed_precision(self.device)
-        #: whether torch.compile was asked for and works here
-        self.compiled = self.preset["compile"] and compile_modules(self._hot_modules(), self.device)
+        #: whether ``compile`` was asked for and works here
+        self.compiled = self.preset["compile"] and (
+            self.device.type == "cuda" or compile_modules(self._hot_modules(), self.device)
+        )
+        self._pool = GraphPool() if self.compiled and self.device.type == "cuda" else None
+        self._model_update = self._graphed("world model", self._learn_model)
+        self._behavior_updates = {
+            name: self._graphed(f"{name} behaviour", partial(self._learn_behavior, name)) for name in self.behaviors
+        }
 
     @property
     def explores(self) -> bool:
@@ -278,16 +287,13 @@ class Challenger:
         :raises RuntimeError: if a loss is not finite, naming the term; the parts updated before it keep their update
         """
         sequences = self._to_device(batch)
-        with mixed_precision(self.device, self.preset["amp"]):
-            output = self.world_model.loss(sequences)
-        metrics = self._step_world_model(output)
+        output, gradients = self._model_update(*sequences.inputs, *sequences[1:])
+        metrics = self._step_world_model(output, gradients)
         if self.explores:
             metrics.update(self._train_uncertainty(sequences, output))
-        start = self._imagination_starts(sequences, output)
-        if self.explores:
-            metrics.update(self.exploration.update(self.world_model, start, self._imagined_novelty, self.optimizers))
-        if self.task is not None:
-            metrics.update(self.task.update(self.world_model, start, self._imagined_reward, self.optimizers))
+        start, share = self._fill_up(self._imagination_starts(sequences, output), sequences.mask.numel())
+        for name, behavior in self.behaviors.items():
+            metrics.update(behavior.step(self._behavior_updates[name](*start, share), self.optimizers))
         self.trained_updates += 1
         values = torch.stack([value.detach().to(torch.float32) for value in metrics.values()]).tolist()  # one transfer
         return dict(zip(metrics, values, strict=True))
@@ -305,14 +311,35 @@ class Challenger:
             mask,
         )
 
-    def _step_world_model(self, output: WorldModelOutput) -> dict[str, torch.Tensor]:
+    def _graphed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of tensors, as a CUDA graph where ``compile`` is asked for on a GPU."""
+        return function if self._pool is None else Graphed(name, function, self._pool)
+
+    def _learn_model(
+        self, images: torch.Tensor | None, vectors: torch.Tensor | None, *rest: torch.Tensor
+    ) -> tuple[WorldModelOutput, Gradients]:
+        """The world model's losses for the parts of :class:`Sequences`, and their sum's gradients."""
+        with mixed_precision(self.device, self.preset["amp"]):
+            output = self.world_model.loss(Sequences(Inputs(images, vectors), *rest))
+        total = torch.stack(list(output.losses.values())).sum()
+        losses = {name: value.detach() for name, value in output.losses.items()}
+        return output._replace(losses=losses), self.optimizers["world_model"].gradients(total)
+
+    def _learn_behavior(
+        self, name: str, deter: torch.Tensor, stoch: torch.Tensor, stats: torch.Tensor, share: torch.Tensor | None
+    ) -> BehaviorLosses:
+        reward = self._imagined_novelty if name == "exploration" else self._imagined_reward
+        start = LatentState(deter, stoch, stats)
+        return self.behaviors[name].losses(self.world_model, start, reward, self.optimizers, share)
+
+    def _step_world_model(self, output: WorldModelOutput, gradients: Gradients) -> dict[str, torch.Tensor]:
         total = torch.stack(list(output.losses.values())).sum()
         if not torch.isfinite(total):
             broken = {name: value.item() for name, value in output.losses.items() if not math.isfinite(value.item())}
             raise RuntimeError(
                 f"The world model's loss became non-finite in the terms {broken or 'that are summed'}. {ADVICE}"
             )
-        norm = self.optimizers["world_model"].step(total)
+        norm = self.optimizers["world_model"].step(total, gradients)
         losses = {f"{name}_loss": value for name, value in output.losses.items()}
         return {"world_model_loss": total, **losses, **output.metrics, "world_model_grad_norm": norm}
 
@@ -335,6 +362,20 @@ class Challenger:
         if limit is not None and len(index) > limit:
             index = index[torch.randperm(len(index), device=self.device)[:limit]]
         return output.posterior.flatten().select(index)
+
+    def _fill_up(self, start: LatentState, rows: int) -> tuple[LatentState, torch.Tensor | None]:
+        """
+        CUDA graphs need the same number of states every time.
+
+        :param start: states to imagine from
+        :param rows: of the batch that they are from
+        :return: the states and more of them, which count for nothing, and how much each counts; None where all count alike
+        """
+        if self._pool is None:
+            return start, None
+        limit = self.preset["imagination_starts"]
+        n, place = len(start.deter), torch.arange(rows if limit is None else min(limit, rows), device=self.device)
+        return start.select(place % n), (place < n) * (len(place) / n)
 
     def _imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
         return self.uncertainty.novelty(

@@ -3,10 +3,13 @@
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.type_aliases import SequenceBatch
+from sb3_cpm.world_model.behavior import RewardFunction
+from sb3_cpm.world_model.rssm import LatentState
 
 SMALL = {
     "batch_size": 4,
@@ -70,6 +73,12 @@ def weights(challenger: Challenger) -> dict[str, np.ndarray]:
         for name, network in challenger.networks.items()
         for key, value in network.state_dict().items()
     }
+
+
+def update(challenger: Challenger, start: LatentState, reward: RewardFunction) -> dict[str, torch.Tensor]:
+    """Of the exploration behaviour alone."""
+    exploration, optimizers = challenger.exploration, challenger.optimizers
+    return exploration.step(exploration.losses(challenger.world_model, start, reward, optimizers), optimizers)
 
 
 class MovingSquare:

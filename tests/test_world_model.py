@@ -127,9 +127,12 @@ def test_categorical_kl_is_that_of_torch_and_samples_are_one_hot_with_gradients(
     assert left.grad is not None and left.grad.abs().sum() > 0
 
 
-def test_categorical_samples_follow_their_probabilities() -> None:
+@pytest.mark.parametrize("race", [False, True])
+def test_categorical_samples_follow_their_probabilities(race: bool) -> None:
+    """From uniform numbers, as on CPUs, and from exponential ones, as on GPUs."""
     latent, logits = CategoricalLatent(1, 3), torch.tensor([0.5, 0.3, 0.2]).log()
-    samples = latent.sample(logits.expand(20000, 3), latent.noise(20000, like=logits))
+    noise = torch.empty(20000, 1, 3).exponential_() if race else latent.noise(20000, like=logits)
+    samples = latent.sample(logits.expand(20000, 3), noise)
     assert torch.allclose(samples.mean(0), torch.tensor([0.5, 0.3, 0.2]), atol=0.02)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from challenger_helpers import BOTH, IMAGES, SMALL, VECTOR, box, random_batch, small, weights
+from challenger_helpers import BOTH, IMAGES, SMALL, VECTOR, box, random_batch, small, update, weights
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_cpm.challenger import Challenger
@@ -233,7 +233,7 @@ def test_12_behaviour_does_not_train_the_world_model() -> None:
     batch = challenger._to_device(random_batch(VECTOR, 2))
     start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
     before = weights(challenger)
-    challenger.exploration.update(challenger.world_model, start, challenger._imagined_novelty, challenger.optimizers)
+    update(challenger, start, challenger._imagined_novelty)
     assert all(parameter.grad is None for network in challenger.networks.values() for parameter in network.parameters())
     after = weights(challenger)
     changed = {key for key, value in before.items() if not np.array_equal(value, after[key])}

@@ -51,6 +51,23 @@ class Imagination(NamedTuple):
 
 
 RewardFunction = Callable[[Imagination], torch.Tensor]
+Gradients = tuple[torch.Tensor | None, ...]
+
+
+class BehaviorLosses(NamedTuple):
+    """
+    :param actor: the actor's loss, a detached scalar
+    :param actor_gradients: of the actor's parameters
+    :param critic: the critic's loss, a detached scalar
+    :param critic_gradients: of the critic's parameters
+    :param metrics: further numbers worth logging, detached scalars
+    """
+
+    actor: torch.Tensor
+    actor_gradients: Gradients
+    critic: torch.Tensor
+    critic_gradients: Gradients
+    metrics: dict[str, torch.Tensor]
 
 
 class Actor(nn.Module):
@@ -132,17 +149,22 @@ class ActorCritic(nn.Module):
             torch.stack([state.deter for state in states[1:]]),
         )
 
-    def update(
-        self, world_model: WorldModel, start: LatentState, reward: RewardFunction, optimizers: Mapping[str, Optimizer]
-    ) -> dict[str, torch.Tensor]:
+    def losses(
+        self,
+        world_model: WorldModel,
+        start: LatentState,
+        reward: RewardFunction,
+        optimizers: Mapping[str, Optimizer],
+        share: torch.Tensor | None = None,
+    ) -> BehaviorLosses:
         """
-        One update of actor and critic.
+        What one update of actor and critic minimises. Looks at no number on the way: a CUDA graph can hold all of it.
 
         :param world_model: supplies dynamics and continuation
         :param start: states to start in, batch dimension ``(n,)``
         :param reward: differentiable, returns shape ``(H, n)`` for an imagination
         :param optimizers: those of :meth:`make_optimizers`
-        :return: numbers worth logging, detached scalars
+        :param share: how much each start counts, 1 on average, shape ``(n,)``; None where all count alike
         """
         amp = mixed_precision(start.deter.device, self.preset["amp"])
         # what the actor learns goes through world model and slow critic, which learn nothing here
@@ -156,25 +178,34 @@ class ActorCritic(nn.Module):
             returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
         reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
+        share = torch.ones_like(reached[0]) if share is None else share
+        weight = reached * share
 
         objective, entropies = self._objective(imagined, returns, values)
-        actor_loss = -(reached * (objective + self.preset["entropy_scale"] * entropies)).mean()
-        actor_norm = optimizers[f"{self.name}_actor"].step(actor_loss)
+        actor_loss = -(weight * (objective + self.preset["entropy_scale"] * entropies)).mean()
+        actor_gradients = optimizers[f"{self.name}_actor"].gradients(actor_loss)
         with amp:
             predicted = self.critic(imagined.feats.detach()).float().squeeze(-1)
-        critic_loss = (reached * 0.5 * (predicted - returns.detach()).square()).mean()
-        critic_norm = optimizers[f"{self.name}_critic"].step(critic_loss)
+        critic_loss = (weight * 0.5 * (predicted - returns.detach()).square()).mean()
+        critic_gradients = optimizers[f"{self.name}_critic"].gradients(critic_loss)
+        means = {"imagined_reward": rewards, "imagined_return": returns, "entropy": entropies}
+        metrics = {name: (share * value.detach()).mean() for name, value in means.items()}
+        return BehaviorLosses(actor_loss.detach(), actor_gradients, critic_loss.detach(), critic_gradients, metrics)
+
+    def step(self, losses: BehaviorLosses, optimizers: Mapping[str, Optimizer]) -> dict[str, torch.Tensor]:
+        """
+        One update of actor and critic.
+
+        :param losses: of :meth:`losses`
+        :param optimizers: those of :meth:`make_optimizers`
+        :return: numbers worth logging, detached scalars
+        """
+        actor_norm = optimizers[f"{self.name}_actor"].step(losses.actor, losses.actor_gradients)
+        critic_norm = optimizers[f"{self.name}_critic"].step(losses.critic, losses.critic_gradients)
         self._follow_slowly()
-        metrics = {
-            "actor_loss": actor_loss,
-            "critic_loss": critic_loss,
-            "actor_grad_norm": actor_norm,
-            "critic_grad_norm": critic_norm,
-            "imagined_reward": rewards.mean(),
-            "imagined_return": returns.mean(),
-            "entropy": entropies.mean(),
-        }
-        return {f"{self.name}_{key}": value.detach() for key, value in metrics.items()}
+        metrics = {"actor_loss": losses.actor, "critic_loss": losses.critic}
+        metrics |= {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm, **losses.metrics}
+        return {f"{self.name}_{key}": value for key, value in metrics.items()}
 
     def _objective(
         self, imagined: Imagination, returns: torch.Tensor, values: torch.Tensor

@@ -89,12 +89,27 @@ class CategoricalLatent:
         return stats.unflatten(-1, (self.groups, self.classes))
 
     def noise(self, *batch: int, like: torch.Tensor) -> torch.Tensor:
-        """Uniform in [0, 1), one number per variable: thirty times fewer than the Gumbel trick needs, ``(*batch, groups)``."""
-        return torch.rand(*batch, self.groups, device=like.device, dtype=like.dtype)
+        """
+        Random numbers for samples of shape ``(*batch, groups, classes)``; drawn at once for a whole sequence.
+
+        :return: on a CPU, one uniform number per variable, thirty times fewer than a race of exponential ones takes, shape
+            ``(*batch, groups)``; on a GPU, where numbers cost nothing and a cumulative sum is slow, those of the race, shape
+            ``(*batch, groups, classes)``
+        """
+        if like.device.type == "cpu":
+            return torch.rand(*batch, self.groups, device=like.device, dtype=like.dtype)
+        race = torch.empty(*batch, self.groups, self.classes, device=like.device, dtype=like.dtype)
+        return race.exponential_().clamp_(min=torch.finfo(like.dtype).tiny)
 
     def sample(self, stats: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """One-hot sample from the inverse of the cumulative distribution, with the gradient of the probabilities."""
+        """
+        One-hot sample with the gradient of the probabilities: from the inverse of the cumulative distribution, or the winner
+        of a race in which every class arrives after an exponential time, its rate the class's probability.
+        """
         probabilities = F.softmax(self._logits(stats), dim=-1)
+        if noise.dim() == probabilities.dim():
+            winner = (probabilities.detach() / noise).argmax(-1, keepdim=True)
+            return _StraightThrough.apply(probabilities, winner).flatten(-2)
         quantiles = probabilities.detach().cumsum(-1)
         chosen = torch.searchsorted(quantiles, noise.unsqueeze(-1), right=True).clamp_(max=self.classes - 1)
         return _StraightThrough.apply(probabilities, chosen).flatten(-2)

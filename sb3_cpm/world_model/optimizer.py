@@ -1,6 +1,6 @@
 """Adam with what Dreamer adds to it: gradient clipping, decoupled weight decay, and a refusal to step on NaN."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -33,17 +33,25 @@ class Optimizer:
         self.decayed: list[torch.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
         self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
 
-    def step(self, loss: torch.Tensor) -> torch.Tensor:
+    def gradients(self, loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """
-        One update, for this optimizer's parameters only: no gradient is left at, or computed for, any other.
+        :param loss: scalar
+        :return: of every parameter, None where the loss does not depend on it; none is computed for any other parameter
+        """
+        return torch.autograd.grad(loss, self.parameters, allow_unused=True)
+
+    def step(self, loss: torch.Tensor, gradients: Sequence[torch.Tensor | None] | None = None) -> torch.Tensor:
+        """
+        One update, for this optimizer's parameters only: no gradient is left at any other.
 
         :param loss: scalar
+        :param gradients: its :meth:`gradients`, where they are known already
         :return: the gradient's norm before clipping
         :raises RuntimeError: if loss or gradient are not finite; the parameters are then still the good ones
         """
         if not torch.isfinite(loss):
             raise RuntimeError(f"The {self.name} loss became {loss.item()}. {ADVICE}")
-        gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        gradients = self.gradients(loss) if gradients is None else gradients
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         used = [gradient for gradient in gradients if gradient is not None]

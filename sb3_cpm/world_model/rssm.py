@@ -21,7 +21,7 @@ from torch import nn
 from sb3_cpm.world_model.distributions import Latent
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.networks import MLP, GRUCell
-from sb3_cpm.world_model.scan import Scan, Settings, Weights
+from sb3_cpm.world_model.scan import Scan, Settings, Weights, rows_with_resets
 
 
 class LatentState(NamedTuple):
@@ -124,7 +124,7 @@ class RSSM(nn.Module):
         noise = None if deterministic else self.latent.noise(length, n, like=state.deter)
         if noise is not None and mask is None and self._trains_by_hand(embed_in):
             return self._scan(state, noise, first, actions_in, embed_in)
-        resets = is_first.any(dim=1).tolist()
+        resets = rows_with_resets(is_first)
         gaps = None if mask is None else (~mask).any(dim=1).tolist()
 
         deter, stoch, stats = state
@@ -145,9 +145,8 @@ class RSSM(nn.Module):
         return LatentState(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
 
     def _trains_by_hand(self, embed_in: torch.Tensor) -> bool:
-        """Where there is a gradient to compute, and neither torch.compile nor mixed precision has the step."""
-        compiled = self._compiled_call_impl is not None
-        return embed_in.requires_grad and not compiled and not torch.is_autocast_enabled(embed_in.device.type)
+        """Where there is a gradient to compute, and torch.compile does not have the step."""
+        return embed_in.requires_grad and self._compiled_call_impl is None
 
     def _scan(
         self,
@@ -157,7 +156,10 @@ class RSSM(nn.Module):
         actions_in: torch.Tensor,
         embed_in: torch.Tensor,
     ) -> LatentState:
-        """What :meth:`observe` computes step by step, with the gradient by hand."""
+        """
+        What :meth:`observe` computes step by step, with the gradient by hand; in float32 also in mixed precision, since the
+        products are too small for bfloat16 to pay.
+        """
         settings = Settings(self.latent, self.gru.update_bias, self.gru.norm.eps)
         weights = Weights(
             self.input_stoch.weight,
@@ -169,7 +171,8 @@ class RSSM(nn.Module):
             self.posterior_out.bias,
         )
         actions_in, embed_in = actions_in + self.input_stoch.bias, embed_in + self.posterior_deter.bias
-        return LatentState(*Scan.apply(settings, noise, first, state.deter, state.stoch, actions_in, embed_in, *weights))
+        with torch.autocast(embed_in.device.type, enabled=False):
+            return LatentState(*Scan.apply(settings, noise, first, state.deter, state.stoch, actions_in, embed_in, *weights))
 
     def prior(self, deter: torch.Tensor) -> torch.Tensor:
         """Parameters of the prior that belongs to a deterministic state, shape ``(*batch, stats_size)``."""
