@@ -93,11 +93,8 @@ class Challenger:
         self.compiled = self.preset["compile"] and (
             self.device.type == "cuda" or compile_modules(self._hot_modules(), self.device)
         )
-        self._pool = GraphPool() if self.compiled and self.device.type == "cuda" else None
-        self._model_update = self._graphed("world model", self._learn_model)
-        self._behavior_updates = {
-            name: self._graphed(f"{name} behaviour", partial(self._learn_behavior, name)) for name in self.behaviors
-        }
+        self._pool = GraphPool(self.device) if self.compiled and self.device.type == "cuda" else None
+        self._graphs: dict[str, Graphed] = {}
 
     @property
     def explores(self) -> bool:
@@ -287,13 +284,14 @@ class Challenger:
         :raises RuntimeError: if a loss is not finite, naming the term; the parts updated before it keep their update
         """
         sequences = self._to_device(batch)
-        output, gradients = self._model_update(*sequences.inputs, *sequences[1:])
+        output, gradients = self._compute("world model", self._learn_model, *sequences.inputs, *sequences[1:])
         metrics = self._step_world_model(output, gradients)
         if self.explores:
             metrics.update(self._train_uncertainty(sequences, output))
         start, share = self._fill_up(self._imagination_starts(sequences, output), sequences.mask.numel())
         for name, behavior in self.behaviors.items():
-            metrics.update(behavior.step(self._behavior_updates[name](*start, share), self.optimizers))
+            losses = self._compute(f"{name} behaviour", partial(self._learn_behavior, name), *start, share)
+            metrics.update(behavior.step(losses, self.optimizers))
         self.trained_updates += 1
         values = torch.stack([value.detach().to(torch.float32) for value in metrics.values()]).tolist()  # one transfer
         return dict(zip(metrics, values, strict=True))
@@ -311,9 +309,13 @@ class Challenger:
             mask,
         )
 
-    def _graphed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function of tensors, as a CUDA graph where ``compile`` is asked for on a GPU."""
-        return function if self._pool is None else Graphed(name, function, self._pool)
+    def _compute(self, name: str, function: Callable[..., Any], *inputs: torch.Tensor | None) -> Any:
+        """``function(*inputs)``, by a CUDA graph where ``compile`` is asked for on a GPU."""
+        if self._pool is None:
+            return function(*inputs)
+        if name not in self._graphs:
+            self._graphs[name] = Graphed(name, function, self._pool)
+        return self._graphs[name](*inputs)
 
     def _learn_model(
         self, images: torch.Tensor | None, vectors: torch.Tensor | None, *rest: torch.Tensor

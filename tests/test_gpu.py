@@ -72,7 +72,7 @@ def test_cuda_graphs_compute_the_same(latent: dict[str, Any], kind: str) -> None
         assert challenger.compiled is compiled
         torch.manual_seed(0)
         results.append([challenger.train(whole(seed)) for seed in range(6)])
-    assert len(challenger._model_update.recordings) == 1  # type: ignore[attr-defined]
+    assert len(challenger._graphs["world model"].recordings) == 1
     for one, other in zip(*results, strict=True):
         assert one == pytest.approx(other, rel=1e-2, abs=1e-3)
 
@@ -89,7 +89,7 @@ def test_cuda_graphs_for_batches_of_any_shape_with_missing_rows() -> None:
         batch = random_batch(BOTH, 2, length=length)
         batch.mask[-2:, 1] = False
         assert all(np.isfinite(value) for value in challenger.train(batch).values())
-    assert len(challenger._model_update.recordings) == 2  # type: ignore[attr-defined]
+    assert len(challenger._graphs["world model"].recordings) == 2
 
 
 class Looks(Plan2Explore):

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-WARM_UP, MOST_GRAPHS = 2, 4
+WARM_UP = 2  # calls before a function is recorded
+MOST_GRAPHS = 4  # of a function, one for every shape of its inputs: each takes memory
 
 Signature = tuple[tuple[torch.Size, torch.dtype] | None, ...]
 
@@ -32,9 +33,14 @@ class Recording(NamedTuple):
 
 
 class GraphPool:
-    """Memory that the graphs of one challenger share: they never run at the same time."""
+    """
+    Memory that the graphs of one challenger share: they never run at the same time.
 
-    def __init__(self) -> None:
+    :param device: of all their tensors
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
         self.handle = torch.cuda.graph_pool_handle()
 
 
@@ -81,7 +87,8 @@ class Graphed:
         for fixed, new in zip(recording.inputs, inputs, strict=True):
             if fixed is not None and new is not None:
                 fixed.copy_(new)
-        recording.graph.replay()
+        with torch.cuda.device(self.pool.device):
+            recording.graph.replay()
         return recording.outputs
 
     def _without(self, inputs: tuple[torch.Tensor | None, ...]) -> Any:
@@ -106,6 +113,8 @@ class Graphed:
     def _record(self, inputs: tuple[torch.Tensor | None, ...]) -> Recording:
         fixed = tuple(None if one is None else one.clone() for one in inputs)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self.pool.handle):
-            outputs = self.function(*fixed)
+        with torch.cuda.device(self.pool.device):
+            stream = torch.cuda.Stream()  # torch's own stream for recording belongs to the GPU that was the first to use it
+            with torch.cuda.graph(graph, pool=self.pool.handle, stream=stream):
+                outputs = self.function(*fixed)
         return Recording(graph, fixed, outputs)
