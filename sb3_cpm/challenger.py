@@ -78,8 +78,10 @@ class Challenger:
         self.uncertainty_name, kind, defaults = self._uncertainty_class(uncertainty_class)
         self.uncertainty_kwargs = {**defaults, **(uncertainty_kwargs or {})}
         model = self.world_model
-        sizes = LatentSizes(model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim)
-        feat = (self.world_model.feat_dim, self.action_dim, self.preset)
+        sizes = LatentSizes(
+            model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim, model.latent.one_hot
+        )
+        feat = (model.feat_dim, self.action_dim, self.preset, model.latent.one_hot)
         self._uncertainty: Uncertainty | None = None
         self._exploration: ActorCritic | None = None
         if self.preset["train_exploration_behavior"]:
@@ -349,7 +351,7 @@ class Challenger:
         transitions = self._transitions(output.posterior, batch.actions, output.embed)
         # neither into padding nor from the last state of one episode to the first of the next
         valid = batch.mask[1:] & batch.mask[:-1] & ~batch.is_first[1:]
-        transitions = transitions.select(valid)
+        transitions = transitions.flatten() if bool(valid.all()) else transitions.select(valid)  # the one copies nothing
         if not len(transitions.feat):
             return {}
         loss = self.uncertainty.loss(transitions)

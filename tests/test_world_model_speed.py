@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
-from sb3_cpm.world_model import acceleration, activation, deconvolution
+from sb3_cpm.world_model import acceleration, activation, deconvolution, one_hot
 from sb3_cpm.world_model import linear as linear_module
 from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.activation import ELU, elu_
@@ -20,6 +20,7 @@ from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
 from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
 from sb3_cpm.world_model.losses import squared_error
 from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder
+from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear, find_choice
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 
 LATENTS = [GaussianLatent(4), CategoricalLatent(3, 5)]
@@ -299,11 +300,84 @@ def test_drawing_is_a_transposed_convolution(channels: int, height: int, width: 
         assert Drawing(8, channels)(inputs[0]).dtype == torch.bfloat16
 
 
+# ---- one-hot inputs --------------------------------------------------------------------------------------------------
+
+
+def samples(n: int, kind: OneHot, rest: int) -> torch.Tensor:
+    """One-hot vectors, each class at least missing once, and other numbers behind them."""
+    classes = torch.randint(0, kind.classes - 1, (n, kind.groups))
+    return torch.cat((F.one_hot(classes, kind.classes).float().flatten(1), torch.randn(n, rest)), dim=1)
+
+
+@pytest.mark.parametrize("rest", [0, 5])
+@pytest.mark.parametrize("other_way", [False, True])
+def test_layers_with_one_hot_inputs(rest: int, other_way: bool, small_products: None) -> None:
+    kind = OneHot(3, 4)
+    inputs = samples(300, kind, rest).requires_grad_(True)
+    weight, bias = leaves((7, 12 + rest), (7,))
+    choice = find_choice(inputs, kind, 7)
+    assert choice is not None
+    if other_way:
+        matrix = weight.detach().t().contiguous().requires_grad_(True)
+        found = gradients(lambda x, m, b: one_hot.one_hot_affine(x, choice, m, b), [inputs, matrix, bias])
+        expected = gradients(lambda x, m, b: x @ m + b, [inputs, matrix, bias])
+        assert found[2].is_contiguous()
+    else:
+        layer = OneHotLinear(12 + rest, 7, kind)
+        call = {"weight": weight, "bias": bias}
+        found = gradients(
+            lambda x, w, b: torch.func.functional_call(layer, {"weight": w, "bias": b}, x), [inputs, *call.values()]
+        )
+        expected = gradients(F.linear, [inputs, *call.values()])
+        assert "_Product" in type(layer(inputs).grad_fn).__name__ and found[2].is_contiguous()
+    assert_equal(found, expected, 1e-5)
+
+
+def test_what_is_not_one_hot_is_multiplied(small_products: None) -> None:
+    kind, inputs = OneHot(3, 4), samples(300, OneHot(3, 4), 2)
+    assert find_choice(inputs, kind, 7) is not None
+    probabilities, reset, other = inputs.clone(), inputs.clone(), inputs.clone()
+    probabilities[17, 4:8] = torch.tensor([0.2, 0.3, 0.4, 0.1])
+    reset[17] = 0.0
+    other[17, :4] = float("nan")
+    for one in (probabilities, reset, other, inputs[:200], inputs.double()):
+        assert find_choice(one, kind, 7) is None
+    assert find_choice(inputs, None, 7) is None
+    layer = OneHotLinear(14, 7, kind)
+    assert torch.equal(layer(probabilities), F.linear(probabilities, layer.weight, layer.bias))
+
+
+def test_a_challenger_learns_the_same_from_one_hot_samples(small_products: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = []
+    for rows in (1, 10**9):
+        monkeypatch.setattr(one_hot, "MIN_ROWS", rows)
+        torch.manual_seed(0)
+        challenger = small(
+            BOTH, latent="categorical", stoch_size=4, stoch_classes=5, imagination_starts=None, train_task_behavior=True
+        )
+        batches = [random_batch(BOTH, 2, length=20, n=5, seed=seed) for seed in range(3)]
+        results.append([challenger.train(batch) for batch in batches])
+    for one, other in zip(*results, strict=True):
+        assert one == pytest.approx(other, rel=1e-3, abs=1e-4)
+
+
 # ---- ensemble --------------------------------------------------------------------------------------------------------
 
 
 def test_heads_one_by_one_are_the_heads_at_once(small_products: None) -> None:
     ensemble, (inputs,) = Ensemble(3, 5, 2, layers=2, units=7), leaves((70, 5))
+    weights = [inputs, *ensemble.parameters()]
+    results = []
+    for outputs in (torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)):
+        torch.manual_seed(4)
+        results.append([outputs, *torch.autograd.grad((outputs * torch.randn_like(outputs)).sum(), weights)])
+    assert_equal(*results, 1e-4)
+
+
+def test_heads_with_one_hot_inputs(small_products: None) -> None:
+    kind = OneHot(3, 4)
+    ensemble, inputs = Ensemble(3, 14, 2, layers=2, units=7, one_hot=kind), samples(300, kind, 2).requires_grad_(True)
+    assert find_choice(inputs, kind, 7) is not None
     weights = [inputs, *ensemble.parameters()]
     results = []
     for outputs in (torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)):

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
+from sb3_cpm.world_model.one_hot import OneHot
+
 
 class Transitions(NamedTuple):
     """
@@ -39,19 +41,24 @@ class Transitions(NamedTuple):
         """Whole latent of state t+1, shape ``(*batch, feat_dim)``."""
         return torch.cat((self.next_stoch, self.next_deter), dim=-1)
 
+    def flatten(self) -> "Transitions":
+        """All batch dimensions in one."""
+        return Transitions(*(None if part is None else part.flatten(0, -2) for part in self))  # type: ignore[arg-type]
+
     def select(self, index: torch.Tensor | slice) -> "Transitions":
         """Those that an index, a mask or a slice picks."""
         return Transitions(*(None if part is None else part[index] for part in self))  # type: ignore[arg-type]
 
 
 class LatentSizes(NamedTuple):
-    """Sizes of what a measure reads and predicts."""
+    """Sizes of what a measure reads and predicts, and which of the latent's first numbers are one-hot vectors, if any."""
 
     feat: int
     action: int
     stoch: int
     deter: int
     embed: int
+    one_hot: OneHot | None = None
 
 
 class Uncertainty(nn.Module, ABC):

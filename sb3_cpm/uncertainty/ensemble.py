@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
@@ -14,6 +13,8 @@ from sb3_cpm.uncertainty.scale import EPSILON, root
 from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.activation import elu_
 from sb3_cpm.world_model.linear import affine, is_large
+from sb3_cpm.world_model.losses import squared_error
+from sb3_cpm.world_model.one_hot import OneHot, find_choice, one_hot_affine
 
 
 class Ensemble(nn.Module):
@@ -25,10 +26,13 @@ class Ensemble(nn.Module):
     :param output_dim: size of the output
     :param layers: hidden layers
     :param units: size of each of them
+    :param one_hot: which inputs are one-hot vectors
     :raises ValueError: for fewer than two heads
     """
 
-    def __init__(self, heads: int, input_dim: int, output_dim: int, layers: int, units: int) -> None:
+    def __init__(
+        self, heads: int, input_dim: int, output_dim: int, layers: int, units: int, one_hot: OneHot | None = None
+    ) -> None:
         super().__init__()
         if heads < 2:
             raise ValueError(f"Disagreement needs at least two `heads`, got {heads}.")
@@ -38,7 +42,7 @@ class Ensemble(nn.Module):
             bound = math.sqrt(6.0 / (size_in + size_out))  # Glorot, for each head on its own
             self.weights.append(nn.Parameter(torch.empty(heads, size_in, size_out).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.zeros(heads, 1, size_out)))
-        self.heads = heads
+        self.heads, self.one_hot = heads, one_hot
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """
@@ -62,10 +66,14 @@ class Ensemble(nn.Module):
         outputs = []
         last = len(self.weights) - 1
         weights, biases = ([part.unbind(0) for part in parts] for parts in (self.weights, self.biases))
+        choice = find_choice(inputs, self.one_hot, self.biases[0].shape[-1])  # one for all heads
         for head in range(self.heads):
             hidden = inputs
             for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-                hidden = affine(hidden, weight[head], bias[head][0])
+                if layer == 0 and choice is not None:
+                    hidden = one_hot_affine(hidden, choice, weight[head], bias[head][0])
+                else:
+                    hidden = affine(hidden, weight[head], bias[head][0])
                 if layer < last:
                     hidden = elu_(hidden)
             outputs.append(hidden)
@@ -133,5 +141,5 @@ def ensemble_loss(predictions: Sequence[torch.Tensor] | torch.Tensor, targets: t
     :param predictions: of each head, shape ``(n, dim)``
     :param targets: shape ``(n, dim)``
     """
-    errors = [F.mse_loss(one, targets, reduction="sum") for one in predictions]
-    return 0.5 * torch.stack(errors).sum() / len(targets)
+    errors = [squared_error(one, targets).sum() for one in predictions]
+    return torch.stack(errors).sum() / len(targets)

@@ -46,7 +46,7 @@ class Plan2Explore(ScaledUncertainty):
             raise ValueError(f"`target` must be one of {TARGETS}, got {target!r}.")
         self.target = target
         output_dim = {"feat": sizes.feat, "stoch": sizes.stoch, "deter": sizes.deter, "embed": sizes.embed}[target]
-        self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units)
+        self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units, sizes.one_hot)
         self._rated: tuple[torch.Tensor | None, torch.Tensor | None] = None, None
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:

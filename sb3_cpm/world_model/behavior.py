@@ -25,6 +25,7 @@ from sb3_cpm.world_model.distributions import TruncatedNormal
 from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
+from sb3_cpm.world_model.one_hot import OneHot
 from sb3_cpm.world_model.optimizer import Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import WorldModel
@@ -78,13 +79,14 @@ class Actor(nn.Module):
     :param action_dim: number of action dimensions
     :param layers: hidden layers
     :param units: size of each of them
+    :param one_hot: which of the latent's numbers are one-hot vectors
     """
 
     min_std = 0.1
 
-    def __init__(self, feat_dim: int, action_dim: int, layers: int, units: int) -> None:
+    def __init__(self, feat_dim: int, action_dim: int, layers: int, units: int, one_hot: OneHot | None = None) -> None:
         super().__init__()
-        self.net = MLP(feat_dim, layers, units, 2 * action_dim)
+        self.net = MLP(feat_dim, layers, units, 2 * action_dim, one_hot)
 
     def forward(self, feat: torch.Tensor) -> TruncatedNormal:
         mean, raw = self.net(feat).float().chunk(2, dim=-1)
@@ -97,14 +99,17 @@ class ActorCritic(nn.Module):
     :param feat_dim: size of the latent
     :param action_dim: number of action dimensions
     :param preset: sizes and constants, see :mod:`sb3_cpm.presets`
+    :param one_hot: which of the latent's numbers are one-hot vectors
     """
 
     updates: torch.Tensor
 
-    def __init__(self, name: str, feat_dim: int, action_dim: int, preset: Mapping[str, Any]) -> None:
+    def __init__(
+        self, name: str, feat_dim: int, action_dim: int, preset: Mapping[str, Any], one_hot: OneHot | None = None
+    ) -> None:
         super().__init__()
-        self.name, self.preset = name, preset
-        self.actor = Actor(feat_dim, action_dim, preset["actor_layers"], preset["actor_units"])
+        self.name, self.preset, self.one_hot = name, preset, one_hot
+        self.actor = Actor(feat_dim, action_dim, preset["actor_layers"], preset["actor_units"], one_hot)
         self.critic = self._make_critic(feat_dim)
         self.target_critic = self.critic
         if preset["slow_target"]:
@@ -113,7 +118,7 @@ class ActorCritic(nn.Module):
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
 
     def _make_critic(self, feat_dim: int) -> MLP:
-        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1)
+        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1, self.one_hot)
 
     def make_optimizers(self) -> dict[str, Optimizer]:
         """Optimizers of actor and critic, by name."""

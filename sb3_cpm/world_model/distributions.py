@@ -12,6 +12,8 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
+from sb3_cpm.world_model.one_hot import OneHot
+
 SQRT_2PI = math.sqrt(2.0 * math.pi)
 SQRT_2 = math.sqrt(2.0)
 
@@ -24,6 +26,7 @@ class GaussianLatent:
     """
 
     min_std = 0.1
+    one_hot = None
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -84,6 +87,7 @@ class CategoricalLatent:
     def __init__(self, groups: int, classes: int) -> None:
         self.groups, self.classes = groups, classes
         self.size = self.stats_size = groups * classes
+        self.one_hot = OneHot(groups, classes)
 
     def _logits(self, stats: torch.Tensor) -> torch.Tensor:
         return stats.unflatten(-1, (self.groups, self.classes))

@@ -91,6 +91,11 @@ def onednn_works() -> bool:
     return all(torch.allclose(one, F.linear(left, right, bias), atol=1e-4) for one in found)
 
 
+def multiply(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """``left @ right.T`` of large matrices on a CPU, by the faster of both; no gradients."""
+    return _multiply(left, right) if prefers_onednn() else left @ right.t()
+
+
 def _multiply(left: torch.Tensor, right: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
     """``left @ right.T + bias`` for any strides without overlap."""
     return torch.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")

@@ -14,6 +14,7 @@ from sb3_cpm.world_model.activation import ELU
 from sb3_cpm.world_model.deconvolution import Drawing
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
+from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear
 
 CACHED_NUMBERS = 2**21  # of a feature map that several operations find in the cache, 8 MB
 
@@ -31,12 +32,15 @@ class MLP(nn.Sequential):
     :param layers: number of hidden layers
     :param units: size of each of them
     :param output_dim: size of the linear output layer; None ends with the last hidden layer's ELU
+    :param one_hot: which inputs are one-hot vectors
     """
 
-    def __init__(self, input_dim: int, layers: int, units: int, output_dim: int | None = None) -> None:
+    def __init__(
+        self, input_dim: int, layers: int, units: int, output_dim: int | None = None, one_hot: OneHot | None = None
+    ) -> None:
         modules: list[nn.Module] = []
-        for _ in range(layers):
-            modules += [Linear(input_dim, units), ELU()]
+        for layer in range(layers):
+            modules += [Linear(input_dim, units) if layer else OneHotLinear(input_dim, units, one_hot), ELU()]
             input_dim = units
         if output_dim is not None:
             modules.append(Linear(input_dim, output_dim))

@@ -1,0 +1,145 @@
+"""
+Dense layers that read categorical samples, on CPUs.
+
+Of the 1224 numbers of DreamerV2's latent 1024 are 32 one-hot vectors. Their product with a matrix is a sum of 32 of its rows,
+and a row's gradient is the sum over those who chose it: a thirtieth of the arithmetic, and in practice a third of the time.
+What flows back into the samples is a gradient of all classes, and stays the product it is.
+"""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch.autograd.function import once_differentiable
+
+from sb3_cpm.world_model.linear import Linear, is_large, multiply
+
+MIN_ROWS = 256  # below, finding out what was chosen costs more than it saves
+
+
+class OneHot(NamedTuple):
+    """
+    The first inputs of a layer are so many one-hot vectors, side by side.
+
+    :param groups: how many
+    :param classes: numbers of each
+    """
+
+    groups: int
+    classes: int
+
+    @property
+    def size(self) -> int:
+        return self.groups * self.classes
+
+
+class Choice:
+    """
+    Which class each variable has, in every row of a batch.
+
+    :param columns: positions of the ones, shape ``(n, groups)``
+    :param size: of all one-hot vectors together
+    """
+
+    def __init__(self, columns: torch.Tensor, size: int) -> None:
+        self.columns, self.size = columns, size
+
+    def add_up(self, matrix: torch.Tensor) -> torch.Tensor:
+        """
+        :param matrix: shape ``(size, size_out)``
+        :return: the one-hot vectors' product with it, shape ``(n, size_out)``
+        """
+        return F.embedding_bag(self.columns, matrix, mode="sum")
+
+    @cached_property
+    def rows(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """For one position after the other the rows that have a one there, and where each position's begin."""
+        groups, classes = self.columns.shape[1], self.size // self.columns.shape[1]
+        chosen, order = (self.columns.t() - classes * torch.arange(groups).unsqueeze(1)).sort(dim=1, stable=True)
+        edges = torch.searchsorted(chosen.contiguous(), torch.arange(classes).expand(groups, classes).contiguous())
+        return order.flatten(), (edges + len(self.columns) * torch.arange(groups).unsqueeze(1)).flatten()
+
+    def distribute(self, gradient: torch.Tensor) -> torch.Tensor:
+        """
+        :param gradient: shape ``(n, size_out)``
+        :return: the transposed one-hot vectors' product with it, the gradient of a matrix, shape ``(size, size_out)``
+        """
+        order, starts = self.rows
+        return F.embedding_bag(order, gradient, starts, mode="sum")
+
+
+def find_choice(inputs: torch.Tensor, one_hot: OneHot | None, size_out: int) -> Choice | None:
+    """
+    What was chosen, or None where looking does not pay (few rows, small matrices, everything but float32 on a CPU), or where
+    the inputs are no samples but probabilities.
+
+    :param inputs: shape ``(n, size_in)``
+    :param one_hot: which of them are one-hot; None for a layer without such inputs
+    :param size_out: of the layer
+    """
+    if one_hot is None or inputs.dim() != 2 or len(inputs) < MIN_ROWS or not is_large(inputs, size_out):
+        return None
+    inputs = inputs.detach()
+    blocks = inputs[:, : one_hot.size].unflatten(1, one_hot)
+    classes = (blocks @ torch.arange(float(one_hot.classes))).long().clamp_(0, one_hot.classes - 1)
+    columns = classes + one_hot.classes * torch.arange(one_hot.groups)
+    return Choice(columns, one_hot.size) if bool((inputs.gather(1, columns) == 1.0).all()) else None
+
+
+def one_hot_affine(inputs: torch.Tensor, choice: Choice, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    """
+    ``inputs @ matrix + bias``, differentiable once.
+
+    :param inputs: shape ``(n, size_in)``
+    :param choice: what their first numbers say
+    :param matrix: shape ``(size_in, size_out)``
+    :param bias: shape ``(size_out,)``
+    """
+    return _Product.apply(inputs, choice, matrix, bias)
+
+
+class OneHotLinear(Linear):
+    """
+    ``torch.nn.Linear`` for inputs that begin with one-hot vectors.
+
+    :param size_in: all inputs
+    :param size_out: outputs
+    :param one_hot: which inputs are one-hot; None for an ordinary layer
+    """
+
+    def __init__(self, size_in: int, size_out: int, one_hot: OneHot | None = None) -> None:
+        super().__init__(size_in, size_out)
+        self.one_hot = one_hot
+
+    def forward(self, input: torch.Tensor) -> torch.Tensor:
+        choice = find_choice(input, self.one_hot, len(self.weight))
+        return super().forward(input) if choice is None else _Product.apply(input, choice, self.weight.t(), self.bias)
+
+
+class _Product(torch.autograd.Function):
+    """:func:`one_hot_affine`; the matrix may lie in memory either way, and its gradient lies as it does."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: torch.Tensor, choice: Choice, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(inputs, matrix)
+        ctx.choice = choice
+        rest = torch.addmm(bias, inputs[:, choice.size :], matrix[choice.size :])
+        return rest.add_(choice.add_up(matrix[: choice.size].contiguous()))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        inputs, matrix = ctx.saved_tensors
+        choice: Choice = ctx.choice
+        gradient = gradient.contiguous()  # the gradient of a sum has no strides
+        to_inputs = to_matrix = to_bias = None
+        if ctx.needs_input_grad[0]:
+            to_inputs = multiply(gradient, matrix)
+        if ctx.needs_input_grad[2]:
+            to_matrix = torch.empty_like(matrix)  # with its strides
+            to_matrix[: choice.size] = choice.distribute(gradient)
+            to_matrix[choice.size :] = inputs[:, choice.size :].t() @ gradient
+        if ctx.needs_input_grad[3]:
+            to_bias = gradient.sum(0)
+        return to_inputs, None, to_matrix, to_bias
