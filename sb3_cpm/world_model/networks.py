@@ -150,15 +150,18 @@ class ConvDecoder(nn.Module):
     :param image_shape: ``(channels, height, width)``
     :param depth: channels before the last layer
     :param layers: number of transposed convolutions
+    :param one_hot: which inputs are one-hot vectors
     """
 
-    def __init__(self, input_dim: int, image_shape: tuple[int, int, int], depth: int, layers: int) -> None:
+    def __init__(
+        self, input_dim: int, image_shape: tuple[int, int, int], depth: int, layers: int, one_hot: OneHot | None = None
+    ) -> None:
         super().__init__()
         channels, height, width = image_shape
         layers = cnn_layer_count(height, width, layers)
         widths = [depth * min(2**layer, 8) for layer in reversed(range(layers))]
         self.feature_map = (widths[0], height // 2**layers, width // 2**layers)
-        self.linear = Linear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2])
+        self.linear = OneHotLinear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2], one_hot)
         modules: list[nn.Module] = []
         for wide, narrow in pairwise(widths):
             modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), ELU()]
@@ -206,14 +209,23 @@ class Decoder(nn.Module):
     :param layers: of the CNN
     :param vector_layers: hidden layers of the MLP
     :param vector_units: size of each of them
+    :param one_hot: which of the latent's numbers are one-hot vectors
     """
 
     def __init__(
-        self, feat_dim: int, spec: ObservationSpec, depth: int, layers: int, vector_layers: int, vector_units: int
+        self,
+        feat_dim: int,
+        spec: ObservationSpec,
+        depth: int,
+        layers: int,
+        vector_layers: int,
+        vector_units: int,
+        one_hot: OneHot | None = None,
     ) -> None:
         super().__init__()
-        self.cnn = None if spec.image_shape is None else ConvDecoder(feat_dim, spec.image_shape, depth, layers)
-        self.mlp = None if spec.vector_dim == 0 else MLP(feat_dim, vector_layers, vector_units, spec.vector_dim)
+        self.cnn = None if spec.image_shape is None else ConvDecoder(feat_dim, spec.image_shape, depth, layers, one_hot)
+        vector = (feat_dim, vector_layers, vector_units, spec.vector_dim, one_hot)
+        self.mlp = None if spec.vector_dim == 0 else MLP(*vector)
 
     def forward(self, feat: torch.Tensor) -> Inputs:
         return Inputs(

@@ -9,6 +9,7 @@ What flows back into the samples is a gradient of all classes, and stays the pro
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
@@ -16,11 +17,12 @@ from torch.autograd.function import once_differentiable
 from sb3_cpm.world_model.linear import Linear, is_large, multiply
 
 MIN_ROWS = 256  # below, finding out what was chosen costs more than it saves
+WIDTH = 128  # columns of a matrix at a time, so few that all its rows stay in the cache while they are picked
 
 
 class OneHot(NamedTuple):
     """
-    The first inputs of a layer are so many one-hot vectors, side by side.
+    The first inputs of a layer are so many one-hot vectors, side by side (or probabilities, which are multiplied as ever).
 
     :param groups: how many
     :param classes: numbers of each
@@ -50,23 +52,28 @@ class Choice:
         :param matrix: shape ``(size, size_out)``
         :return: the one-hot vectors' product with it, shape ``(n, size_out)``
         """
-        return F.embedding_bag(self.columns, matrix, mode="sum")
+        parts = matrix.split(WIDTH, dim=1)
+        return torch.cat([F.embedding_bag(self.columns, part.contiguous(), mode="sum") for part in parts], dim=1)
 
     @cached_property
     def rows(self) -> tuple[torch.Tensor, torch.Tensor]:
         """For one position after the other the rows that have a one there, and where each position's begin."""
-        groups, classes = self.columns.shape[1], self.size // self.columns.shape[1]
-        chosen, order = (self.columns.t() - classes * torch.arange(groups).unsqueeze(1)).sort(dim=1, stable=True)
-        edges = torch.searchsorted(chosen.contiguous(), torch.arange(classes).expand(groups, classes).contiguous())
-        return order.flatten(), (edges + len(self.columns) * torch.arange(groups).unsqueeze(1)).flatten()
+        groups = self.columns.shape[1]
+        classes = self.columns % (self.size // groups)
+        # NumPy sorts small integers by their digits, ten times faster than by comparing them
+        order = np.argsort(classes.t().numpy().astype(np.uint16), axis=1, kind="stable")
+        counts = torch.bincount(self.columns.flatten(), minlength=self.size)
+        return torch.from_numpy(order.ravel()), counts.cumsum(0) - counts
 
-    def distribute(self, gradient: torch.Tensor) -> torch.Tensor:
+    def distribute(self, gradient: torch.Tensor, to_matrix: torch.Tensor) -> None:
         """
-        :param gradient: shape ``(n, size_out)``
-        :return: the transposed one-hot vectors' product with it, the gradient of a matrix, shape ``(size, size_out)``
+        :param gradient: of the product, shape ``(n, size_out)``
+        :param to_matrix: where the matrix's gradient is written, the transposed one-hot vectors' product with it, shape
+            ``(size, size_out)``
         """
         order, starts = self.rows
-        return F.embedding_bag(order, gradient, starts, mode="sum")
+        for part, to_part in zip(gradient.split(WIDTH, dim=1), to_matrix.split(WIDTH, dim=1), strict=True):
+            to_part.copy_(F.embedding_bag(order, part.contiguous(), starts, mode="sum"))
 
 
 def find_choice(inputs: torch.Tensor, one_hot: OneHot | None, size_out: int) -> Choice | None:
@@ -125,7 +132,7 @@ class _Product(torch.autograd.Function):
         ctx.save_for_backward(inputs, matrix)
         ctx.choice = choice
         rest = torch.addmm(bias, inputs[:, choice.size :], matrix[choice.size :])
-        return rest.add_(choice.add_up(matrix[: choice.size].contiguous()))
+        return rest.add_(choice.add_up(matrix[: choice.size]))
 
     @staticmethod
     @once_differentiable
@@ -138,7 +145,7 @@ class _Product(torch.autograd.Function):
             to_inputs = multiply(gradient, matrix)
         if ctx.needs_input_grad[2]:
             to_matrix = torch.empty_like(matrix)  # with its strides
-            to_matrix[: choice.size] = choice.distribute(gradient)
+            choice.distribute(gradient, to_matrix[: choice.size])
             to_matrix[choice.size :] = inputs[:, choice.size :].t() @ gradient
         if ctx.needs_input_grad[3]:
             to_bias = gradient.sum(0)

@@ -21,6 +21,7 @@ from torch import nn
 from sb3_cpm.world_model.distributions import Latent
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.networks import MLP, GRUCell
+from sb3_cpm.world_model.one_hot import OneHotLinear
 from sb3_cpm.world_model.scan import Scan, Settings, Weights, rows_with_resets
 
 
@@ -68,7 +69,7 @@ class RSSM(nn.Module):
         self.latent = latent
         self.deter_size = deter_size
         self.feat_dim = latent.size + deter_size
-        self.input_stoch = Linear(latent.size, hidden_size)
+        self.input_stoch = OneHotLinear(latent.size, hidden_size, latent.one_hot)
         self.input_action = Linear(action_dim, hidden_size, bias=False)
         self.gru = GRUCell(hidden_size, deter_size)
         self.prior_net = MLP(deter_size, 1, hidden_size, latent.stats_size)

@@ -76,7 +76,7 @@ class WorldModel(nn.Module):
         self.latent = make_latent(preset)
         self.rssm = RSSM(self.latent, preset["deter_size"], preset["hidden_size"], self.embed_dim, action_dim)
         self.feat_dim = self.rssm.feat_dim
-        self.decoder = Decoder(self.feat_dim, spec, *cnn, *vector)
+        self.decoder = Decoder(self.feat_dim, spec, *cnn, *vector, self.latent.one_hot)
         head = (self.feat_dim, preset["head_layers"], preset["head_units"], 1, self.latent.one_hot)
         self.reward_head = MLP(*head)
         self.continue_head = MLP(*head) if preset["continue_head"] else None
