@@ -6,12 +6,12 @@ other, and its share of a run.
 
     pip install -c constraints.txt -e ".[run,maniskill]" sheeprl==0.8.4     # the peer; rows run without it, too
     OMP_NUM_THREADS=1 python benchmarks/world_model.py                      # all rows, 15 minutes
-    OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 behavior --threads 1 --repeats 7
+    OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 ensemble --threads 1 --repeats 7
     python benchmarks/world_model.py --device cuda                          # also with `compile` and bfloat16, 3 minutes
 
-sheeprl's own compiler needs more than four minutes for sequences of 50 steps, so that on a GPU ours with ``compile`` meets its
-plain code, unless ``--compile-peer`` is given (with ``--length 10`` it takes less). Without ManiSkill (which GPU machines may
-lack) a step of the simulator counts as 13 ms and the whole run is that of a task of PickCube's sizes that costs nothing.
+sheeprl's own compiler takes more than 200 seconds for sequences of 50 steps, so that on a GPU ours with ``compile`` meets its
+plain code, unless ``--compile-peer`` is given (with ``--length 8`` it takes a minute). Without ManiSkill (which GPU machines
+may lack) a step of the simulator counts as 13 ms and the whole run is that of a task of PickCube's sizes that costs nothing.
 
 On a busy machine set ``OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=0``: two threads that wait by spinning take it from each other.
 
@@ -50,6 +50,7 @@ from sb3_cpm.type_aliases import SequenceBatch
 ACTION_DIM, STATE_DIM = 7, 29
 STEP_SECONDS = 0.013  # of PickCube-v1 with light rendering on one core
 PEER = importlib.util.find_spec("sheeprl") is not None
+SIMULATOR = importlib.util.find_spec("mani_skill") is not None
 #: DreamerV2's latents, everything else as in the report; 3 convolutions make 4x4 feature maps of 32x32 images
 CATEGORICAL: dict[str, Any] = {"latent": "categorical", "stoch_size": 32, "stoch_classes": 32}
 
@@ -342,7 +343,7 @@ class Episode(NamedTuple):
 
 def make_episode(actions: np.ndarray) -> Episode:
     """In the simulator, and without ManiSkill of noise and as slow as the simulator is."""
-    if importlib.util.find_spec("mani_skill") is None:
+    if not SIMULATOR:
         space = make_space(32, 2)
         space.seed(0)
         states = [space.sample() for _ in range(len(actions) + 1)]
@@ -437,7 +438,7 @@ class Vectors(gymnasium.Env):
 
 def make_run_env() -> tuple[str, gymnasium.Env]:
     """Name and environment of the row that measures whole runs."""
-    if importlib.util.find_spec("mani_skill") is None:
+    if not SIMULATOR:
         return "vectors without a simulation", Vectors()
     from sb3_cpm.envs import make_maniskill_env
 

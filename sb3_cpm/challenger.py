@@ -23,13 +23,13 @@ from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.uncertainty.ensemble import Ensemble
 from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
-from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Gradients, Imagination
+from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imagination
 from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, read_file, write_file
 from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.observations import UINT8_RANGE, Inputs, ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.open_loop import OpenLoop, open_loop
-from sb3_cpm.world_model.optimizer import ADVICE, Optimizer
+from sb3_cpm.world_model.optimizer import ADVICE, Gradients, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import Sequences, WorldModel, WorldModelOutput
 
@@ -91,12 +91,14 @@ class Challenger:
         self.optimizers = self._make_optimizers()
         if self.preset["amp"]:
             check_mixed_precision(self.device)
-        #: whether ``compile`` was asked for and works here
-        self.compiled = self.preset["compile"] and (
-            self.device.type == "cuda" or compile_modules(self._hot_modules(), self.device)
-        )
-        self._pool = GraphPool(self.device) if self.compiled and self.device.type == "cuda" else None
+        self._pool: GraphPool | None = None
         self._graphs: dict[str, Graphed] = {}
+        #: whether ``compile`` was asked for and works here
+        self.compiled: bool = self.preset["compile"]
+        if self.compiled and self.device.type == "cuda":
+            self._pool = GraphPool(self.device)
+        elif self.compiled:
+            self.compiled = compile_modules(self._hot_modules(), self.device)
 
     @property
     def explores(self) -> bool:
@@ -325,9 +327,8 @@ class Challenger:
         """The world model's losses for the parts of :class:`Sequences`, and their sum's gradients."""
         with mixed_precision(self.device, self.preset["amp"]):
             output = self.world_model.loss(Sequences(Inputs(images, vectors), *rest))
-        total = torch.stack(list(output.losses.values())).sum()
         losses = {name: value.detach() for name, value in output.losses.items()}
-        return output._replace(losses=losses), self.optimizers["world_model"].gradients(total)
+        return output._replace(losses=losses), self.optimizers["world_model"].gradients(output.total)
 
     def _learn_behavior(
         self, name: str, deter: torch.Tensor, stoch: torch.Tensor, stats: torch.Tensor, share: torch.Tensor | None
@@ -337,7 +338,7 @@ class Challenger:
         return self.behaviors[name].losses(self.world_model, start, reward, self.optimizers, share)
 
     def _step_world_model(self, output: WorldModelOutput, gradients: Gradients) -> dict[str, torch.Tensor]:
-        total = torch.stack(list(output.losses.values())).sum()
+        total = output.total
         if not torch.isfinite(total):
             broken = {name: value.item() for name, value in output.losses.items() if not math.isfinite(value.item())}
             raise RuntimeError(

@@ -324,11 +324,10 @@ def test_layers_with_one_hot_inputs(rest: int, other_way: bool, small_products: 
         assert found[2].is_contiguous()
     else:
         layer = OneHotLinear(12 + rest, 7, kind)
-        call = {"weight": weight, "bias": bias}
         found = gradients(
-            lambda x, w, b: torch.func.functional_call(layer, {"weight": w, "bias": b}, x), [inputs, *call.values()]
+            lambda x, w, b: torch.func.functional_call(layer, {"weight": w, "bias": b}, x), [inputs, weight, bias]
         )
-        expected = gradients(F.linear, [inputs, *call.values()])
+        expected = gradients(F.linear, [inputs, weight, bias])
         assert "_Product" in type(layer(inputs).grad_fn).__name__ and found[2].is_contiguous()
     assert_equal(found, expected, 1e-5)
 

@@ -26,7 +26,7 @@ from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.one_hot import OneHot
-from sb3_cpm.world_model.optimizer import Optimizer
+from sb3_cpm.world_model.optimizer import Gradients, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import WorldModel
 
@@ -52,7 +52,6 @@ class Imagination(NamedTuple):
 
 
 RewardFunction = Callable[[Imagination], torch.Tensor]
-Gradients = tuple[torch.Tensor | None, ...]
 
 
 class BehaviorLosses(NamedTuple):

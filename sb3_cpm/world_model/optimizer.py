@@ -1,10 +1,13 @@
 """Adam with what Dreamer adds to it: gradient clipping, decoupled weight decay, and a refusal to step on NaN."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import nn
+
+#: Of every parameter, None where the loss does not depend on it.
+Gradients = tuple[torch.Tensor | None, ...]
 
 
 class Optimizer:
@@ -33,14 +36,14 @@ class Optimizer:
         self.decayed: list[torch.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
         self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
 
-    def gradients(self, loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def gradients(self, loss: torch.Tensor) -> Gradients:
         """
         :param loss: scalar
-        :return: of every parameter, None where the loss does not depend on it; none is computed for any other parameter
+        :return: of this optimizer's parameters; none is computed for any other
         """
         return torch.autograd.grad(loss, self.parameters, allow_unused=True)
 
-    def step(self, loss: torch.Tensor, gradients: Sequence[torch.Tensor | None] | None = None) -> torch.Tensor:
+    def step(self, loss: torch.Tensor, gradients: Gradients | None = None) -> torch.Tensor:
         """
         One update, for this optimizer's parameters only: no gradient is left at any other.
 

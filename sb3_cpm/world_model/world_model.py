@@ -49,6 +49,11 @@ class WorldModelOutput(NamedTuple):
     posterior: LatentState
     embed: torch.Tensor
 
+    @property
+    def total(self) -> torch.Tensor:
+        """What is minimised, a scalar."""
+        return torch.stack(list(self.losses.values())).sum()
+
 
 def make_latent(preset: Mapping[str, Any]) -> Latent:
     """The kind of stochastic state that a preset asks for."""
