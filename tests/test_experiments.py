@@ -23,7 +23,7 @@ from sb3_cpm.experiments.collect import collect
 from sb3_cpm.experiments.evaluation import evaluate
 from sb3_cpm.experiments.grid import attempt, perform_all
 from sb3_cpm.experiments.player_losses import player_losses
-from sb3_cpm.experiments.run_folder import LockedError, locked
+from sb3_cpm.experiments.run_folder import LockedError, description, locked
 from sb3_cpm.experiments.single_run import Watcher, perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
@@ -179,6 +179,45 @@ def test_a_finished_run_is_skipped(tmp_path):
     assert perform(spec, tmp_path).outcome == "skipped"
     assert time.perf_counter() - started < 2
     assert csv_files(first.folder) == before
+
+
+def test_a_run_of_two_experiments_is_made_once(tmp_path):
+    spec = make_spec(steps=80)
+    other = replace(spec, experiment="other", agent="Player", env="task")
+    first = perform(spec, tmp_path)
+    expected = perform(other, tmp_path / "made")
+    taken = perform(other, tmp_path)
+    assert taken.outcome == "skipped" and "taken from test/sac/toy/seed0" in taken.message
+    assert csv_files(taken.folder) == csv_files(expected.folder) != csv_files(first.folder)
+    config = yaml.safe_load((taken.folder / "config.yml").read_text())
+    assert config.pop("taken_from") == "test/sac/toy/seed0"
+    assert config == yaml.safe_load((expected.folder / "config.yml").read_text())
+    assert perform(other, tmp_path).message == "its result is there"
+
+
+def test_a_run_with_other_settings_is_not_taken(tmp_path):
+    spec = make_spec(steps=80)
+    perform(replace(spec, experiment="seed", seed=1), tmp_path)
+    perform(replace(spec, experiment="settings", overrides={**TINY, "batch_size": 16}), tmp_path)
+    unfinished = perform(replace(spec, experiment="unfinished"), tmp_path).folder
+    (unfinished / "finished.yml").unlink()
+    assert perform(replace(spec, experiment="version"), tmp_path).outcome == "finished"
+    config = tmp_path / "version/sac/toy/seed0/config.yml"
+    config.write_text(yaml.safe_dump({**yaml.safe_load(config.read_text()), "sb3_cpm": "0.0.1"}))
+    assert perform(spec, tmp_path).outcome == "finished"
+
+
+def test_runs_that_experiments_of_the_report_share():
+    def fingerprints(name):
+        runs = EXPERIMENTS[name].runs()
+        loaded = {spec.name: description(spec, load_agent(spec.config, spec.env_id, spec.overrides)) for spec in runs}
+        return {(one["run"]["agent"], one["run"]["env"], one["run"]["seed"]): one["fingerprint"] for one in loaded.values()}
+
+    state, controllers = fingerprints("pickcube-state"), fingerprints("controllers")
+    shared = set(state) & set(controllers)
+    assert len(shared) == 6 and all(state[key] == controllers[key] for key in shared)
+    linear = fingerprints("decays")["CPM linear", "MountainCarContinuous-v0", 0]
+    assert linear == fingerprints("mountaincar")["CPM-SAC", "MountainCarContinuous-v0", 0]
 
 
 def test_other_hyperparameters_are_refused_by_name(tmp_path):

@@ -260,7 +260,7 @@ _ALL = (
         "the controllers are not similarly good; success came with the switch from pd_joint_delta_pos to pd_ee_delta_pose",
         (SAC,),
         "curves",
-        Plan(CONTROLLERS, 100_000, 10_000, 20, 3, STATE, cost="12 CPU minutes per run"),
+        Plan(CONTROLLERS, 100_000, 10_000, 20, 3, STATE, cost="12 to 28 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:2], 2000, 1000, 5, 1, STATE, cost="1 minute on 2 cores"),
     ),
     Experiment(

@@ -19,6 +19,7 @@ from sb3_cpm.experiments.evaluation import evaluate, success_of
 from sb3_cpm.experiments.player_losses import log_player_losses
 from sb3_cpm.experiments.specification import RunSpec
 from sb3_cpm.experiments.tables import DIAGNOSTICS, EVALUATIONS, TRAINING, DiagnosticsWriter, Table
+from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
@@ -44,7 +45,7 @@ class RunResult(NamedTuple):
 
 def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda news: None, device: str = "cpu") -> RunResult:
     """
-    Make a run, unless its result is there.
+    Make a run, unless its result is there, if only under the name of another experiment.
 
     :param spec: the run
     :param results: folder of all results
@@ -67,6 +68,9 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
         found = checkpoints.find_checkpoint(folder)
         if found is not None and note is not None:
             raise run_folder.OtherResultError(f"{folder} holds an unfinished run {note}: finish it there, or remove it.")
+        twin = None if found is not None else find_twin(spec, config, results)
+        if twin is not None:
+            return RunResult(spec, "skipped", f"taken from {take_over(spec, config, twin, results)}", folder)
         built = agent.build(spec.seed, device=device, load_path=None if found is None else found / "model.zip")
         try:
             run_folder.write_config(folder, config)

@@ -1,0 +1,59 @@
+"""
+Runs that two experiments have in common are made once: the second experiment takes the first one's tables.
+
+SAC of ``pickcube-state``, for example, is half of the comparison of controllers, and CPM-SAC of ``mountaincar`` is one of the
+decay models.
+"""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from sb3_cpm.experiments import run_folder
+from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.tables import EVALUATIONS, Table
+
+
+def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:
+    """
+    :param spec: a run
+    :param config: its :func:`~sb3_cpm.experiments.run_folder.description`
+    :param results: folder of all results
+    :return: the folder of a finished run with the same settings, seed and version of this package, under another name
+    """
+    own = spec.folder(results)
+    for path in sorted(results.glob(f"*/*/*/{own.name}/{run_folder.CONFIG}")):
+        folder = path.parent
+        if folder == own or not run_folder.is_finished(folder):
+            continue
+        theirs = run_folder.read_yaml(path)
+        if all(theirs.get(key) == config[key] for key in ("fingerprint", "sb3_cpm")):
+            return folder
+    return None
+
+
+def take_over(spec: RunSpec, config: dict[str, Any], twin: Path, results: Path) -> str:
+    """
+    Make a run's folder from its twin's. What says that it is finished comes last, so that a killed process leaves no half.
+
+    :param spec: the run
+    :param config: its description; ``taken_from`` is added to what is written, and the versions are the twin's
+    :param twin: from :func:`find_twin`
+    :param results: folder of all results
+    :return: the twin's name
+    """
+    folder, name = spec.folder(results), "/".join(twin.parts[-4:])
+    names = {"experiment": spec.experiment, "agent": spec.agent, "env": spec.env}
+    for path in twin.glob("*.csv"):
+        if path.stem != "evaluations":
+            (folder / path.name).write_bytes(path.read_bytes())
+            continue
+        table = Table(folder / path.name, EVALUATIONS, 0)
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                table.add([{**row, **names}[column] for column in EVALUATIONS])
+        table.close()
+    versions = run_folder.read_yaml(twin / run_folder.CONFIG)["versions"]
+    run_folder.write_config(folder, {**config, "versions": versions, "taken_from": name})
+    run_folder.write_finished(folder, run_folder.read_yaml(twin / run_folder.FINISHED))
+    return name
