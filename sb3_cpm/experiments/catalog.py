@@ -45,6 +45,7 @@ CPM = Contender("CPM-SAC", "cpm_sac")
 CPM_HER = Contender("CPM-SAC+HER", "cpm_sac", {"replay_buffer_kwargs": {"n_sampled_goal": 4}})
 HIGH = Contender("CPM high exploration", "cpm_sac_high_exploration")
 SIMPLE = Contender("CPM simple", "cpm_sac")
+SAC_CLOUD = Contender("SAC point cloud", "sac")
 REPORT = Contender("CPM report", "cpm_sac_report")
 TUNED = Contender("CPM tuned", "cpm_sac_tuned")
 #: What rl_zoo3 has found for SAC on MountainCarContinuous-v0, with state-dependent exploration and observations as they come.
@@ -109,6 +110,16 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "pickcube-visual",
+        "",
+        "PickCube-v1 from images and point clouds, as far as two CPU cores go",
+        "Figure 4 of the report has more steps, and SAC is not among its agents",
+        (SIMPLE, SAC_CLOUD, DREAMER, PPO_CLOUD, PPO_RGBD),
+        "curves",
+        Plan((PICKCUBE,), 30_000, 5_000, 10, 3, cost="10 to 40 CPU minutes per run, by agent and processor"),
+        _QUICK,
     ),
     Experiment(
         "pickcube-parts",
