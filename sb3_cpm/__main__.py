@@ -84,7 +84,14 @@ def make_parser() -> argparse.ArgumentParser:
     which = reproduce.add_mutually_exclusive_group(required=True)
     which.add_argument("--figure", metavar="N|NAME", help="number of the report's figure, or name of an experiment")
     which.add_argument("--list", action="store_true", help="all experiments with their cost")
-    reproduce.add_argument("--quick", action="store_true", help="a version that takes minutes on two cores")
+    size = reproduce.add_mutually_exclusive_group()
+    for version, text in (
+        ("quick", "that takes minutes on two cores"),
+        ("short", "on the same tasks that two cores can bear"),
+    ):
+        size.add_argument(
+            f"--{version}", dest="version", action="store_const", const=version, default="full", help=f"a version {text}"
+        )
     reproduce.add_argument("--seeds", type=int, help="how many (default: as planned)")
     reproduce.add_argument("--agents", nargs="+", metavar="NAME", help="run only these, as the figure names them")
     reproduce.add_argument("--tasks", nargs="+", metavar="NAME", help="run only these, as the figure names them")

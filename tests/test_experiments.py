@@ -16,7 +16,7 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_cpm.__main__ import main
-from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_experiment, run_experiment, summary_table
+from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_data, find_experiment, run_experiment, summary_table
 from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
 from sb3_cpm.experiments.collect import collect
@@ -313,7 +313,7 @@ def tiny_experiment(monkeypatch):
 
 
 def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
-    results = run_experiment("tiny", quick=False, results=tmp_path, jobs=0, tell=lambda line: None)
+    results = run_experiment("tiny", "full", results=tmp_path, jobs=0, tell=lambda line: None)
     assert [result.outcome for result in results] == ["finished"] * 4
     figure = draw("99", tmp_path)
     labels = {text.get_text() for text in figure.legends[0].get_texts()}
@@ -338,22 +338,25 @@ def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
 
 
 def test_figures_of_another_experiments_runs(tmp_path, tiny_experiment):
-    assert ensure_data("tiny", tmp_path, seeds=1) is True
-    assert draw("tiny", tmp_path, quick=True).axes
-    figure = draw("8", tmp_path, source="tiny", quick=True, task="toy")
+    assert ensure_data("tiny", tmp_path, seeds=1) == "quick"
+    assert find_data(["mountaincar", "tiny"], tmp_path) == {"tiny": "quick"}
+    assert draw("tiny", tmp_path, "quick").axes
+    figure = draw("8", tmp_path, source="tiny", version="quick", task="toy")
     epsilon = next(axes for axes in figure.axes if axes.get_title(loc="left").startswith("epsilon"))
     assert [line.get_label() for line in epsilon.lines] == ["CPM (1 seed)"]
     values = epsilon.lines[0].get_ydata()
     assert 0 < values[-1] < values[0] < 1
     with pytest.raises(ValueError, match="no data for 'tiny' on 'toi'"):
-        draw("8", tmp_path, source="tiny", quick=True, task="toi")
+        draw("8", tmp_path, source="tiny", version="quick", task="toi")
     shutil.move(tmp_path / "tiny-quick", tmp_path / "tiny")
-    assert ensure_data("tiny", tmp_path) is False
+    assert ensure_data("tiny", tmp_path) == "full" == find_data(["tiny"], tmp_path)["tiny"]
+    with pytest.raises(ValueError, match="tiny has no version 'short', but: full, quick"):
+        draw("tiny", tmp_path, "short")
 
 
 def test_a_crashed_run_is_recorded_and_the_others_go_on(tmp_path, tiny_experiment):
     lines = []
-    results = run_experiment("broken", quick=False, results=tmp_path, jobs=0, seeds=1, tell=lines.append)
+    results = run_experiment("broken", "full", results=tmp_path, jobs=0, seeds=1, tell=lines.append)
     assert [result.outcome for result in results] == ["crashed", "finished"]
     assert "Traceback" in (results[0].folder / "crashed.txt").read_text()
     assert main(["reproduce", "--figure", "broken", "--seeds", "1", "--jobs", "0", "--results", str(tmp_path)]) == 1
@@ -431,7 +434,7 @@ def test_misspelt_names(tmp_path, capsys):
     assert main(["reproduce", "--figure", "12"]) == 1
     assert "figures: 3, 4, 5" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"make it with `python -m sb3_cpm reproduce --figure mountaincar --quick --results "):
-        draw("mountaincar", tmp_path, quick=True)
+        draw("mountaincar", tmp_path, "quick")
     assert main(["reproduce", "--list"]) == 0
     assert "five-agents-training" in capsys.readouterr().out
 
@@ -469,17 +472,16 @@ def test_figures_by_number():
     assert find_experiment("B.3").name == "controllers" and find_experiment("b.4").name == "decays"
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-@pytest.mark.parametrize("quick", [True, False])
-def test_every_planned_run_has_valid_hyperparameters(name, quick):
+@pytest.mark.parametrize("name, version", [(name, version) for name, one in EXPERIMENTS.items() for version in one.plans])
+def test_every_planned_run_has_valid_hyperparameters(name, version):
     experiment = EXPERIMENTS[name]
-    specs = list(experiment.runs(quick))
+    specs = list(experiment.runs(version))
     assert len({spec.name for spec in specs}) == len(specs)
     for spec in specs:
-        if spec.seed == experiment.plan(quick).first_seed:
+        if spec.seed == experiment.plan(version).first_seed:
             load_agent(spec.config, spec.env_id, spec.overrides)
     if experiment.source:
-        of_source = {(spec.agent, spec.env) for spec in EXPERIMENTS[experiment.source].runs(quick)}
+        of_source = {(spec.agent, spec.env) for spec in EXPERIMENTS[experiment.source].runs(version)}
         assert {(spec.agent, spec.env) for spec in specs} <= of_source
 
 

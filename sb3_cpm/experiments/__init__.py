@@ -2,12 +2,12 @@
 The experiments of the report: runs as data, results as tidy CSV, figures from these.
 
 >>> from sb3_cpm.experiments import draw, run_experiment, summary_table
->>> run_experiment("mountaincar", quick=True, jobs=2)  # doctest: +SKIP
->>> draw("mountaincar", quick=True)  # doctest: +SKIP
+>>> run_experiment("mountaincar", "quick", jobs=2)  # doctest: +SKIP
+>>> draw("mountaincar", version="quick")  # doctest: +SKIP
 """
 
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
-from sb3_cpm.experiments.reports import draw, ensure_data, listing, reproduce, run_experiment, summary_table
+from sb3_cpm.experiments.reports import draw, ensure_data, find_data, listing, reproduce, run_experiment, summary_table
 from sb3_cpm.experiments.single_run import RunResult
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 
@@ -21,6 +21,7 @@ __all__ = [
     "Task",
     "draw",
     "ensure_data",
+    "find_data",
     "find_experiment",
     "listing",
     "reproduce",

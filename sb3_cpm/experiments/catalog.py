@@ -3,8 +3,10 @@ The experiments of the report, and the two that say most in little time, as data
 
 Contenders name files of ``zoo_configs/``. Quick versions run on ``CPMToy-v0``, which has a camera, a point cloud and a state
 like the robot tasks but needs no renderer: they show that everything works and what the figures look like, not what is true.
+Short versions run on the robot, for as long as two cores can bear, and on tasks whose files ManiSkill brings along.
 """
 
+from dataclasses import replace
 from typing import Any
 
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, Task
@@ -71,7 +73,8 @@ DREAMER = Contender("Dreamer", "dreamer")
 PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
 PPO_RGBD = Contender("PPO RGBD", "ppo_rgbd")
 PPO_CLOUD = Contender("PPO point cloud", "ppo_pointcloud")
-FIVE = (HIGH, SIMPLE, DREAMER, PPO_CLOUD, PPO_RGBD)
+#: The report's five, and the control experiment that it lacks.
+PICKCUBE_AGENTS = (HIGH, SIMPLE, DREAMER, PPO_CLOUD, PPO_RGBD, SAC_CLOUD)
 LOG = Contender("CPM log", "cpm_sac", challenger(uncertainty_kwargs={"metric": "log"}))
 DECAYS = tuple(
     Contender(f"CPM {name}", "cpm_sac", challenger(decay=name))
@@ -97,6 +100,8 @@ MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_tar
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
 
 _FULL = Plan((PICKCUBE,), 200_000, 20_000, 20, 5, cost="5 to 10 hours per run on a core, less with a GPU")
+#: A seventh of it, for those who have no days.
+_SHORT = Plan((PICKCUBE,), 30_000, 5_000, 10, 3, cost="10 to 40 CPU minutes per run, by agent and processor")
 _QUICK = Plan((TOY,), 1500, 500, 5, 2, SMALL, cost="2 to 6 minutes on 2 cores")
 _PPO_QUICK = Plan((TOY,), 3000, 1000, 5, 2, SMALL, cost="2 minutes on 2 cores")
 
@@ -110,16 +115,6 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
-    ),
-    Experiment(
-        "pickcube-visual",
-        "",
-        "PickCube-v1 from images and point clouds, as far as two CPU cores go",
-        "Figure 4 of the report has more steps, and SAC is not among its agents",
-        (SIMPLE, SAC_CLOUD, DREAMER, PPO_CLOUD, PPO_RGBD),
-        "curves",
-        Plan((PICKCUBE,), 30_000, 5_000, 10, 3, cost="10 to 40 CPU minutes per run, by agent and processor"),
-        _QUICK,
     ),
     Experiment(
         "pickcube-parts",
@@ -177,27 +172,30 @@ _ALL = (
         "curves",
         Plan(VISUAL, 200_000, 20_000, 20, 5, cost="1 to 2 hours per run on a core"),
         _PPO_QUICK,
+        short=replace(_SHORT, tasks=tuple(task for task in VISUAL if task.name in ("PickCube-v1", "StackCube-v1"))),
     ),
     Experiment(
         "five-agents",
         "4",
-        "Five agents on PickCube-v1, evaluation",
+        "The report's five agents on PickCube-v1, and SAC: evaluation",
         "both handicapped CPM agents succeed sometimes and early; PPO on point clouds has the best return and never succeeds",
-        FIVE,
+        PICKCUBE_AGENTS,
         "curves",
         _FULL,
         _QUICK,
+        short=_SHORT,
     ),
     Experiment(
         "five-agents-training",
         "5",
-        "Five agents on PickCube-v1, training episodes",
+        "The report's five agents on PickCube-v1, and SAC: training episodes",
         "exploration is high, so that training succeeds seldom; PPO on point clouds does best there",
-        FIVE,
+        PICKCUBE_AGENTS,
         "training",
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "challenge-quality",
@@ -209,6 +207,7 @@ _ALL = (
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "challenge-filters",
@@ -220,6 +219,7 @@ _ALL = (
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "artificial-rewards",
@@ -231,6 +231,7 @@ _ALL = (
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "plan2explore",
@@ -241,6 +242,7 @@ _ALL = (
         "plan2explore",
         _FULL,
         _QUICK,
+        short=_SHORT,
     ),
     Experiment(
         "world-model",
@@ -252,6 +254,7 @@ _ALL = (
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "player",
@@ -263,6 +266,7 @@ _ALL = (
         _FULL,
         _QUICK,
         source="five-agents",
+        short=_SHORT,
     ),
     Experiment(
         "controllers",

@@ -30,7 +30,7 @@ class Data:
     notes: list[str]
 
 
-def collect(experiment: Experiment, results: str | Path, quick: bool = False, task: str | None = None) -> Data:
+def collect(experiment: Experiment, results: str | Path, version: str = "full", task: str | None = None) -> Data:
     """
     Read all runs of an experiment.
 
@@ -39,18 +39,18 @@ def collect(experiment: Experiment, results: str | Path, quick: bool = False, ta
 
     :param experiment: whose contenders and tasks are looked for
     :param results: folder of all results
-    :param quick: the quick version
+    :param version: which of the experiment's versions
     :param task: only the runs on this one
     :return: the tables
     :raises ValueError: where there is no data, with the command that makes it
     """
-    root = Path(results) / experiment.folder_name(quick)
+    root = Path(results) / experiment.folder_name(version)
     agents = [contender.name for contender in experiment.contenders]
     found = [path.parent for path in sorted(root.glob(f"*/{task or '*'}/seed*/{CONFIG}"))]
     folders = [folder for folder in found if folder.parts[-3] in agents]
     if not folders:
         of_task = f" on {task!r}" if task else ""
-        flags = (" --quick" if quick else "") + ("" if str(results) == "results" else f" --results {results}")
+        flags = ("" if version == "full" else f" --{version}") + ("" if str(results) == "results" else f" --results {results}")
         raise NoDataError(
             f"There is no data for {experiment.name!r}{of_task} in {root}: make it with "
             f"`python -m sb3_cpm reproduce --figure {experiment.name}{flags}`."

@@ -98,33 +98,34 @@ PANELS: dict[str, tuple[Panel, ...]] = {
 def draw_experiment(
     experiment: Experiment,
     results: str | Path,
-    quick: bool = False,
+    version: str = "full",
     source: Experiment | None = None,
     task: str | None = None,
 ) -> tuple[Figure, list[str]]:
     """
     :param experiment: what is drawn
     :param results: folder of all results
-    :param quick: the quick version
+    :param version: which of the experiment's versions
     :param source: another experiment whose runs are drawn in the same way
     :param task: only the runs on this one
     :return: the figure, and notes about its data
     :raises ValueError: where there is no data, with the command that makes it
     """
-    drawing, title, experiment = experiment.drawing, _title(experiment, quick, source, task), source or experiment
-    data = collect(experiment, results, quick, task)
+    drawing, title, experiment = experiment.drawing, _title(experiment, version, source, task), source or experiment
+    data = collect(experiment, results, version, task)
     with plt.rc_context(STYLE):
         figure = DRAWINGS[drawing](experiment, data)
         figure.suptitle(title, fontweight="bold")
     return figure, data.notes
 
 
-def _title(experiment: Experiment, quick: bool, source: Experiment | None, task: str | None) -> str:
+def _title(experiment: Experiment, version: str, source: Experiment | None, task: str | None) -> str:
     number = f"Figure {experiment.figure}: " if experiment.figure else ""
-    version = f" (quick version, on {', '.join(task.name for task in experiment.quick.tasks)})" if quick else ""
+    tasks = task or ", ".join(one.name for one in (source or experiment).plan(version).tasks)
+    told = "" if version == "full" else f"{version} version, on {tasks}"
     if source is not None:
-        version = f"\nruns of {source.name}" + (f", {task}" if task else "")
-    return f"{number}{experiment.title}{version}"
+        return f"{number}{experiment.title}\nruns of {source.name}, {told or tasks}"
+    return f"{number}{experiment.title}" + (f" ({told})" if told else "")
 
 
 def _agents(experiment: Experiment, table: pd.DataFrame) -> list[str]:

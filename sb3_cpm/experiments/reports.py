@@ -1,6 +1,6 @@
 """An experiment from start to figure, and its numbers as a table: what notebooks and the command line call."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ SUMMARY_SCORES = ("success_at_end", "success_once", "return")
 
 def run_experiment(
     name: str,
-    quick: bool = True,
+    version: str = "quick",
     results: str | Path = RESULTS,
     seeds: int | None = None,
     jobs: int = 1,
@@ -37,7 +37,7 @@ def run_experiment(
     Make the runs of an experiment that are not there yet.
 
     :param name: of an experiment, or a figure's number
-    :param quick: the version that takes minutes; its results are kept apart from the full ones
+    :param version: "full", "short" or "quick"; their results are kept apart
     :param results: folder of all results
     :param seeds: how many; None: as planned
     :param jobs: processes at a time; 0: in this process
@@ -47,12 +47,12 @@ def run_experiment(
     :param agents: only these, by name
     :param tasks: only these, by name
     :return: what became of each run; a crashed one does not stop the others
-    :raises ValueError: for an unknown name, with the nearest
+    :raises ValueError: for an unknown name, with the nearest, and for a version that the experiment does not have
     """
     experiment = find_experiment(name)
     if seeds is not None and seeds < 1:
         raise ValueError(f"seeds={seeds}: expected 1 or more")
-    specs = list(experiment.runs(quick, seeds, steps, agents, tasks))
+    specs = list(experiment.runs(version, seeds, steps, agents, tasks))
     return perform_all(specs, Path(results), jobs, tell, device)
 
 
@@ -63,7 +63,7 @@ def ensure_data(
     steps: int | None = None,
     jobs: int = 0,
     tell: Callable[[str], None] = print,
-) -> bool:
+) -> str:
     """
     Make sure that there is something to draw: for notebooks.
 
@@ -73,32 +73,51 @@ def ensure_data(
     :param steps: likewise
     :param jobs: likewise; 0: in this process
     :param tell: is given lines about the progress
-    :return: ``quick`` for :func:`draw`: False where there are results of the full version, else True, and the quick version
-        has been run as far as it was missing
+    :return: the version for :func:`draw`: "full" or "short" where there are results of it, else "quick", which has then been
+        run as far as it was missing
     :raises RuntimeError: if one of its runs crashed or was refused
     """
-    try:
-        collect(find_experiment(name), results)
-        return False
-    except NoDataError:
-        pass
-    for outcome in run_experiment(name, True, results, seeds, jobs, tell, steps):
+    for version in find_experiment(name).plans:
+        if version != "quick" and _is_there(name, results, version):
+            return version
+    for outcome in run_experiment(name, "quick", results, seeds, jobs, tell, steps):
         if outcome.outcome in ("crashed", "refused"):
             raise RuntimeError(f"{outcome.spec.name} {outcome.outcome}: {outcome.message}")
+    return "quick"
+
+
+def _is_there(name: str, results: str | Path, version: str) -> bool:
+    """Whether there is anything to draw."""
+    try:
+        collect(find_experiment(name), results, version)
+    except NoDataError:
+        return False
     return True
+
+
+def find_data(names: Iterable[str], results: str | Path = RESULTS) -> dict[str, str]:
+    """
+    What else there is to draw.
+
+    :param names: of experiments
+    :param results: folder of all results
+    :return: the best version that there are results of, for those that have any
+    """
+    best = {name: next((one for one in find_experiment(name).plans if _is_there(name, results, one)), None) for name in names}
+    return {name: version for name, version in best.items() if version is not None}
 
 
 def draw(
     name: str,
     results: str | Path = RESULTS,
-    quick: bool = False,
+    version: str = "full",
     source: str | None = None,
     task: str | None = None,
 ) -> "Figure":
     """
     :param name: of an experiment, or a figure's number
     :param results: folder of all results
-    :param quick: draw the quick version
+    :param version: "full", "short" or "quick"
     :param source: name of another experiment whose runs are drawn in this figure's way
     :param task: only the runs on this one; for the figures of logged numbers where an experiment has several
     :return: the figure, from the CSV files alone
@@ -107,26 +126,26 @@ def draw(
     from sb3_cpm.experiments.figures import add_note, draw_experiment
 
     other = None if source is None else find_experiment(source)
-    figure, notes = draw_experiment(find_experiment(name), results, quick, other, task)
+    figure, notes = draw_experiment(find_experiment(name), results, version, other, task)
     if notes:
         add_note(figure, "Note: " + "; ".join(notes))
     return figure
 
 
-def summary_table(name: str, results: str | Path = RESULTS, quick: bool = False, task: str | None = None) -> pd.DataFrame:
+def summary_table(name: str, results: str | Path = RESULTS, version: str = "full", task: str | None = None) -> pd.DataFrame:
     """
     The last evaluation that all seeds have, in numbers.
 
     :param name: of an experiment, or a figure's number
     :param results: folder of all results
-    :param quick: the quick version
+    :param version: "full", "short" or "quick"
     :param task: only this one
     :return: a row per task and agent: seeds, step, and per score the interquartile mean with its 95% interval as text;
         ``to_markdown()`` makes text of it
     :raises ValueError: where there is no data, with the command that makes it
     """
     experiment = find_experiment(name)
-    table = collect(experiment, results, quick, task).tables["evaluations"]
+    table = collect(experiment, results, version, task).tables["evaluations"]
     rows = []
     for task in dict.fromkeys(table["env"]):
         for contender in experiment.contenders:
@@ -149,15 +168,15 @@ def _last(part: pd.DataFrame) -> dict[str, object]:
     return row
 
 
-def figure_path(experiment: Experiment, results: str | Path, quick: bool) -> Path:
+def figure_path(experiment: Experiment, results: str | Path, version: str) -> Path:
     """:return: where :func:`reproduce` saves the figure"""
     number = f"figure_{experiment.figure}_" if experiment.figure else ""
-    return Path(results) / "figures" / f"{number}{experiment.name}{'-quick' if quick else ''}.png"
+    return Path(results) / "figures" / f"{number}{experiment.name}{'' if version == 'full' else f'-{version}'}.png"
 
 
 def reproduce(
     name: str,
-    quick: bool = False,
+    version: str = "full",
     seeds: int | None = None,
     jobs: int = 1,
     results: str | Path = RESULTS,
@@ -179,21 +198,21 @@ def reproduce(
     experiment = find_experiment(name)
     failed: list[RunResult] = []
     if not draw_only:
-        plan = experiment.plan(quick)
-        n_runs = len(list(experiment.runs(quick, seeds, steps, agents, tasks)))
+        plan = experiment.plan(version)
+        n_runs = len(list(experiment.runs(version, seeds, steps, agents, tasks)))
         tell(f"{experiment.name}: {n_runs} runs of {steps or plan.steps} steps ({plan.cost}); what is there is skipped")
-        outcomes = run_experiment(name, quick, results, seeds, jobs, tell, steps, device, agents, tasks)
+        outcomes = run_experiment(name, version, results, seeds, jobs, tell, steps, device, agents, tasks)
         failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused")]
         for outcome in failed:
             tell(f"{outcome.outcome}: {outcome.spec.name}: {outcome.message}")
         if len(failed) == len(outcomes):
             raise RuntimeError(f"None of the {len(outcomes)} runs of {experiment.name} could be made; see above.")
-    path = figure_path(experiment, results, quick)
+    path = figure_path(experiment, results, version)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure = draw(name, results, quick)
+    figure = draw(name, results, version)
     save_figure(figure, path)
-    tell(summary_table(name, results, quick).to_string(index=False))
-    for note in collect(experiment, results, quick).notes:
+    tell(summary_table(name, results, version).to_string(index=False))
+    for note in collect(experiment, results, version).notes:
         tell(f"note: {note}")
     tell(f"Drawn: {path}")
     return 1 if failed else 0
@@ -206,7 +225,7 @@ def listing() -> str:
         number = f"figure {experiment.figure}" if experiment.figure else "no figure of the report"
         source = f" (draws the runs of {experiment.source})" if experiment.source else ""
         lines.append(f"{experiment.name}: {experiment.title} [{number}]{source}")
-        for kind, plan in (("full ", experiment.full), ("quick", experiment.quick)):
+        for version, plan in experiment.plans.items():
             runs = plan.seeds * len(plan.tasks) * len(experiment.contenders)
-            lines.append(f"    {kind} {runs:>3} runs of {plan.steps} steps; {plan.cost}")
+            lines.append(f"    {version:<5} {runs:>3} runs of {plan.steps} steps; {plan.cost}")
     return "\n".join(lines)

@@ -10,6 +10,9 @@ from typing import Any, TypeVar
 from sb3_cpm.presets import nearest
 from sb3_cpm.run.evaluation import FIRST_SEED
 
+#: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.
+VERSIONS = ("full", "short", "quick")
+
 
 @dataclass(frozen=True)
 class RunSpec:
@@ -135,6 +138,7 @@ class Experiment:
     :param full: the whole experiment
     :param quick: a version that takes minutes on two cores
     :param source: name of the experiment whose runs it draws, where it needs none of its own
+    :param short: a version for two cores on the same tasks, where the full one takes days
     """
 
     name: str
@@ -146,41 +150,54 @@ class Experiment:
     full: Plan
     quick: Plan
     source: str | None = None
+    short: Plan | None = None
 
-    def plan(self, quick: bool) -> Plan:
-        return self.quick if quick else self.full
+    @property
+    def plans(self) -> dict[str, Plan]:
+        """Its versions, in the order of :data:`VERSIONS`."""
+        plans = {version: getattr(self, version) for version in VERSIONS}
+        return {version: plan for version, plan in plans.items() if plan is not None}
 
-    def folder_name(self, quick: bool) -> str:
-        """:return: where the results are; quick and full ones are never mixed"""
-        return (self.source or self.name) + ("-quick" if quick else "")
+    def plan(self, version: str = "full") -> Plan:
+        """
+        :param version: one of :data:`VERSIONS`
+        :raises ValueError: if this experiment has no such version
+        """
+        if version not in self.plans:
+            raise ValueError(f"{self.name} has no version {version!r}, but: {', '.join(self.plans)}.")
+        return self.plans[version]
+
+    def folder_name(self, version: str = "full") -> str:
+        """:return: where the results are; those of several versions are never mixed"""
+        return (self.source or self.name) + ("" if version == "full" else f"-{version}")
 
     def runs(
         self,
-        quick: bool = False,
+        version: str = "full",
         seeds: int | None = None,
         steps: int | None = None,
         agents: Sequence[str] | None = None,
         tasks: Sequence[str] | None = None,
     ) -> Iterator[RunSpec]:
         """
-        :param quick: the version that takes minutes
+        :param version: one of :data:`VERSIONS`
         :param seeds: how many, from the plan's first; None: the plan's number
         :param steps: of each run; None: the plan's number
         :param agents: names of contenders; None: all
         :param tasks: names of tasks; None: all
         :return: all runs, first seeds first
-        :raises ValueError: for a name that this experiment does not have, with the nearest
+        :raises ValueError: for a version that this experiment does not have, or a name, with the nearest
         """
         from sb3_cpm.zoo.agents import algorithm_of
 
-        plan = self.plan(quick)
+        plan = self.plan(version)
         contenders = _chosen("agent", agents, self.contenders)
         chosen_tasks = _chosen("task", tasks, plan.tasks)
         for seed in range(plan.first_seed, plan.first_seed + (plan.seeds if seeds is None else seeds)):
             for task in chosen_tasks:
                 for contender in contenders:
                     yield RunSpec(
-                        experiment=self.folder_name(quick),
+                        experiment=self.folder_name(version),
                         agent=contender.name,
                         env=task.name,
                         seed=seed,
