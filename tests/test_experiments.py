@@ -435,6 +435,8 @@ def test_misspelt_names(tmp_path, capsys):
     assert "figures: 3, 4, 5" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"make it with `python -m sb3_cpm reproduce --figure mountaincar --quick --results "):
         draw("mountaincar", tmp_path, "quick")
+    assert main(["reproduce", "--figure", "mountaincar", "--short", "--results", str(tmp_path)]) == 1
+    assert "mountaincar has no version 'short', but: full, quick." in capsys.readouterr().err and not list(tmp_path.iterdir())
     assert main(["reproduce", "--list"]) == 0
     assert "five-agents-training" in capsys.readouterr().out
 
@@ -465,6 +467,15 @@ def test_some_agents_and_tasks_only(tmp_path, capsys):
         run_experiment("pickcube-state", agents=["CPM_SAC"], results=tmp_path)
     assert main(["reproduce", "--figure", "pickcube-state", "--tasks", "PickCube", "--results", str(tmp_path)]) == 1
     assert "no task 'PickCube'" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_short_versions_are_on_the_robot():
+    short = {name: experiment.short for name, experiment in EXPERIMENTS.items() if experiment.short}
+    assert {EXPERIMENTS[name].figure for name in short} == {str(number) for number in range(3, 12)}
+    for name, plan in short.items():
+        full = EXPERIMENTS[name].full
+        assert all(task in full.tasks for task in plan.tasks) and plan.steps < full.steps
+        assert EXPERIMENTS[name].folder_name("short").endswith("-short")
 
 
 def test_figures_by_number():
