@@ -105,6 +105,14 @@ _SHORT = Plan((PICKCUBE,), 30_000, 5_000, 10, 3, cost="10 to 40 CPU minutes per 
 _QUICK = Plan((TOY,), 1500, 500, 5, 2, SMALL, cost="2 to 6 minutes on 2 cores")
 _PPO_QUICK = Plan((TOY,), 3000, 1000, 5, 2, SMALL, cost="2 minutes on 2 cores")
 
+
+def _of_five_agents(
+    name: str, figure: str, title: str, claim: str, contenders: tuple[Contender, ...], drawing: str
+) -> Experiment:
+    """A figure that draws the runs of ``five-agents`` in a way of its own."""
+    return Experiment(name, figure, title, claim, contenders, drawing, _FULL, _QUICK, source="five-agents", short=_SHORT)
+
+
 _ALL = (
     Experiment(
         "pickcube-state",
@@ -185,53 +193,37 @@ _ALL = (
         _QUICK,
         short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "five-agents-training",
         "5",
         "The report's five agents on PickCube-v1, and SAC: training episodes",
         "exploration is high, so that training succeeds seldom; PPO on point clouds does best there",
         PICKCUBE_AGENTS,
         "training",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "challenge-quality",
         "6",
         "Rewards r, uncertainty u and the coefficient c of the score",
         "c follows the fluctuating magnitudes and so keeps r and u in balance",
         (HIGH, SIMPLE),
         "quality",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "challenge-filters",
         "7",
         "Tolerances of the challenge filter",
         "all three tolerances adjust to what was accepted and rejected",
         (HIGH, SIMPLE),
         "filters",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "artificial-rewards",
         "8",
         "Exploration and the coefficients of the artificial reward",
         "peaks of the exploration reward are followed by the coefficients of the other terms",
         (HIGH, SIMPLE),
         "rewards",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
     Experiment(
         "plan2explore",
@@ -244,29 +236,21 @@ _ALL = (
         _QUICK,
         short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "world-model",
         "10",
         "Losses of the world model, and its errors",
         "image loss near 5.7, pixel error below 0.1; high exploration keeps the model from understanding rewards",
         (HIGH, SIMPLE, DREAMER),
         "world_model",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
-    Experiment(
+    _of_five_agents(
         "player",
         "11",
         "The player's losses and Q values on D and on I",
         "both are in the same range on both buffers",
         (HIGH, SIMPLE),
         "player",
-        _FULL,
-        _QUICK,
-        source="five-agents",
-        short=_SHORT,
     ),
     Experiment(
         "controllers",

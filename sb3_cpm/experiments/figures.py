@@ -111,17 +111,17 @@ def draw_experiment(
     :return: the figure, and notes about its data
     :raises ValueError: where there is no data, with the command that makes it
     """
-    drawing, title, experiment = experiment.drawing, _title(experiment, version, source, task), source or experiment
-    data = collect(experiment, results, version, task)
+    drawn = source or experiment
+    data = collect(drawn, results, version, task)
+    tasks = ", ".join(dict.fromkeys(data.tables["evaluations"]["env"]))
     with plt.rc_context(STYLE):
-        figure = DRAWINGS[drawing](experiment, data)
-        figure.suptitle(title, fontweight="bold")
+        figure = DRAWINGS[experiment.drawing](drawn, data)
+        figure.suptitle(_title(experiment, version, source, tasks), fontweight="bold")
     return figure, data.notes
 
 
-def _title(experiment: Experiment, version: str, source: Experiment | None, task: str | None) -> str:
+def _title(experiment: Experiment, version: str, source: Experiment | None, tasks: str) -> str:
     number = f"Figure {experiment.figure}: " if experiment.figure else ""
-    tasks = task or ", ".join(one.name for one in (source or experiment).plan(version).tasks)
     told = "" if version == "full" else f"{version} version, on {tasks}"
     if source is not None:
         return f"{number}{experiment.title}\nruns of {source.name}, {told or tasks}"

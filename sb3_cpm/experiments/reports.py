@@ -10,7 +10,7 @@ from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
 from sb3_cpm.experiments.collect import NoDataError, collect
 from sb3_cpm.experiments.grid import perform_all
 from sb3_cpm.experiments.single_run import RunResult
-from sb3_cpm.experiments.specification import Experiment
+from sb3_cpm.experiments.specification import Experiment, of_version
 from sb3_cpm.experiments.statistics import estimate, per_seed
 from sb3_cpm.run.plots import save_figure
 
@@ -77,9 +77,9 @@ def ensure_data(
         run as far as it was missing
     :raises RuntimeError: if one of its runs crashed or was refused
     """
-    for version in find_experiment(name).plans:
-        if version != "quick" and _is_there(name, results, version):
-            return version
+    best = find_data([name], results).get(name, "quick")
+    if best != "quick":
+        return best
     for outcome in run_experiment(name, "quick", results, seeds, jobs, tell, steps):
         if outcome.outcome in ("crashed", "refused"):
             raise RuntimeError(f"{outcome.spec.name} {outcome.outcome}: {outcome.message}")
@@ -171,7 +171,7 @@ def _last(part: pd.DataFrame) -> dict[str, object]:
 def figure_path(experiment: Experiment, results: str | Path, version: str) -> Path:
     """:return: where :func:`reproduce` saves the figure"""
     number = f"figure_{experiment.figure}_" if experiment.figure else ""
-    return Path(results) / "figures" / f"{number}{experiment.name}{'' if version == 'full' else f'-{version}'}.png"
+    return Path(results) / "figures" / f"{number}{of_version(experiment.name, version)}.png"
 
 
 def reproduce(

@@ -14,6 +14,11 @@ from sb3_cpm.run.evaluation import FIRST_SEED
 VERSIONS = ("full", "short", "quick")
 
 
+def of_version(name: str, version: str) -> str:
+    """:return: what a version's results and figure are called: as the experiment where it is the full one"""
+    return name if version == "full" else f"{name}-{version}"
+
+
 @dataclass(frozen=True)
 class RunSpec:
     """
@@ -168,8 +173,13 @@ class Experiment:
         return self.plans[version]
 
     def folder_name(self, version: str = "full") -> str:
-        """:return: where the results are; those of several versions are never mixed"""
-        return (self.source or self.name) + ("" if version == "full" else f"-{version}")
+        """
+        :param version: one of :data:`VERSIONS`
+        :return: where the results are; those of several versions are never mixed
+        :raises ValueError: if this experiment has no such version
+        """
+        self.plan(version)
+        return of_version(self.source or self.name, version)
 
     def runs(
         self,
