@@ -47,7 +47,8 @@ rendering: $(READY) $(RENDERING)
 
 $(VENV)/bin/python:
 	@echo "==> Making a virtual environment in $(VENV)"
-	@python="$$(scripts/find_python.sh "$(PYTHON)")" && "$$python" --version && "$$python" -m venv $(VENV)
+	@python="$$(scripts/find_python.sh "$(PYTHON)")" && "$$python" --version && \
+		{ "$$python" -m venv $(VENV) || { rm -f $@; exit 1; }; }
 
 $(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
 	@echo "==> Installing sb3_cpm[$(EXTRAS)] with the versions of constraints.txt (about 3 minutes)"

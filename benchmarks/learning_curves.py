@@ -16,15 +16,13 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy import stats
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.run.evaluation import FIRST_SEED
-
-# two-sided 97.5% quantiles of Student's t, by degrees of freedom
-T_QUANTILE = [np.nan, 12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228]
 
 
 class FixedEpisodes(BaseCallback):
@@ -138,7 +136,9 @@ def curves(rows: Iterable[dict[str, str]], value: str) -> dict[tuple[str, str], 
 
 def interval(values: np.ndarray) -> float:
     """:return: half of the 95% confidence interval of a mean over seeds, by Student's t; nan for a single seed"""
-    return float(T_QUANTILE[len(values) - 1] * values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+    if len(values) < 2:
+        return np.nan
+    return float(stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def draw(

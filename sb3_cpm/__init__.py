@@ -19,12 +19,34 @@ Algorithm 1 of the report, with the place where each line lives::
         train P on D and I                                                Stable-Baselines3
 """
 
+import importlib
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sb3_cpm.buffers import CPMBuffer
-from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
+if TYPE_CHECKING:
+    from sb3_cpm.buffers import CPMBuffer
+    from sb3_cpm.callbacks import ChallengerCallback
+    from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 __all__ = ["CPMBuffer", "ChallengerCallback", "PointNetExtractor", "PointNetPolicy", "__version__"]
+
+_HOMES = {
+    "CPMBuffer": "sb3_cpm.buffers",
+    "ChallengerCallback": "sb3_cpm.callbacks",
+    "PointNetExtractor": "sb3_cpm.extractors",
+    "PointNetPolicy": "sb3_cpm.extractors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imported when asked for: ``doctor`` and ``--help`` have to work where torch does not."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

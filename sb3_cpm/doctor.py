@@ -66,13 +66,14 @@ def examine() -> Iterator[Finding]:
     """:return: the findings, one by one, since the last ones take some seconds"""
     yield _python()
     yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
-    yield _torch()
+    torch = _torch()
+    yield torch
     yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
     yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
     yield _memory()
     yield _disk()
     yield _video()
-    yield from _rendering()
+    yield from _rendering(torch.well)
 
 
 def _python() -> Finding:
@@ -118,7 +119,11 @@ def _memory_gib(group: Path = Path("/sys/fs/cgroup")) -> tuple[float, float]:
     limit, used = (group / name for name in ("memory.max", "memory.current"))
     if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
         allowed = int(limit.read_text())
-        total, free = min(total, allowed), min(free, allowed - int(used.read_text()))
+        details = group / "memory.stat"
+        fields = dict(line.split() for line in details.read_text().splitlines()) if details.exists() else {}
+        # files that nobody has touched for a while count as used, and are given back as soon as memory is wanted
+        held = int(used.read_text()) - int(fields.get("inactive_file", "0"))
+        total, free = min(total, allowed), min(free, allowed - held)
     return free / 2**30, total / 2**30
 
 
@@ -139,12 +144,15 @@ def _video() -> Finding:
     return Finding("ffmpeg (videos)", True, str(path))
 
 
-def _rendering() -> Iterator[Finding]:
-    from sb3_cpm.envs import rendering, vulkan
-
+def _rendering(torch_works: bool) -> Iterator[Finding]:
+    if not torch_works:
+        yield Finding("SAPIEN renders", False, "not tried without torch", "see torch")
+        return
     if not all(_package(name, "").well for name in ("mani_skill", "sapien")):
         yield Finding("SAPIEN renders", False, "not tried without ManiSkill", "pip install 'sb3_cpm[maniskill]'")
         return
+    from sb3_cpm.envs import rendering, vulkan
+
     probe = rendering.probe_renderer()
     if probe.renderer is None:
         yield Finding("SAPIEN renders", False, probe.problem, rendering.cure())

@@ -10,9 +10,9 @@ makes_venv() {
     "$1" -c 'import ensurepip, venv' >/dev/null 2>&1
 }
 
-candidates="${1:-python3 python3.12 python3.11 python3.10}"
+[ -n "${1:-}" ] || set -- python3 python3.12 python3.11 python3.10
 fitting=""
-for name in $candidates; do
+for name in "$@"; do
     if works "$name"; then
         if makes_venv "$name"; then
             "$name" -c 'import sys; print(sys.executable)'
@@ -33,7 +33,7 @@ if [ -n "$fitting" ]; then
     fi
     echo "$fitting cannot make virtual environments here. Install it once with: sudo apt-get install $package" >&2
 else
-    echo "No Python 3.10, 3.11 or 3.12 found (looked for: $candidates)." >&2
+    echo "No Python 3.10, 3.11 or 3.12 found (looked for: $*)." >&2
     echo "Install one (sudo apt-get install python3 python3-venv), or name yours: make PYTHON=/path/to/python3.11 ..." >&2
 fi
 exit 1

@@ -1,7 +1,9 @@
 """The doctor on this machine, and on machines that lack something."""
 
+import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,11 +84,25 @@ except ImportError as error:
     assert child.stdout.strip() == "said so", child.stderr
 
 
+def test_a_broken_torch_is_a_finding(tmp_path: Path) -> None:
+    """Even where ``import torch`` fails, doctor and help answer."""
+    (tmp_path / "torch").mkdir()
+    (tmp_path / "torch/__init__.py").write_text("raise OSError('libcudnn.so.9: cannot open shared object file')")
+    path = os.pathsep.join((str(tmp_path), str(Path(doctor.__file__).parents[1])))
+    run = partial(subprocess.run, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=120)
+    child = run([sys.executable, "-m", "sb3_cpm", "doctor"])
+    assert "FAIL  torch                 libcudnn.so.9" in child.stdout, child.stderr
+    assert "Not well: " in child.stdout and child.returncode == 1
+    assert "train" in run([sys.executable, "-m", "sb3_cpm", "--help"]).stdout
+
+
 def test_a_container_limit_counts(tmp_path: Path) -> None:
     free, total = doctor._memory_gib()
     assert 0 < free <= total
     (tmp_path / "memory.max").write_text(f"{2**28}\n")
     (tmp_path / "memory.current").write_text(f"{2**27}\n")
     assert doctor._memory_gib(tmp_path) == (0.125, 0.25)
+    (tmp_path / "memory.stat").write_text(f"anon 0\ninactive_file {2**26}\n")  # cache, given back when it is needed
+    assert doctor._memory_gib(tmp_path) == (0.1875, 0.25)
     (tmp_path / "memory.max").write_text("max\n")
     assert doctor._memory_gib(tmp_path)[1] == total

@@ -79,13 +79,18 @@ def test_made_once_and_made_again_when_the_file_or_the_cache_is_broken(
         assert all((a == b).all() for a, b in zip(again, first[0], strict=True))
     assert len(made) == 1
     (cached,) = (tmp_path / "cache/meshes").glob("ball-*.npz")
-    cached.write_bytes(cached.read_bytes()[:100])
-    meshes.light_parts.cache_clear()
-    meshes.light_parts(file)
+    whole = cached.read_bytes()
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :]
+    for damaged in (whole[:100], b"", flipped):
+        cached.write_bytes(damaged)
+        meshes.light_parts.cache_clear()
+        (again,) = meshes.light_parts(file)
+        assert all((a == b).all() for a, b in zip(again, first[0], strict=True))
     Path(file).write_text(Path(file).read_text() + "# changed\n")
     meshes.light_parts.cache_clear()
     meshes.light_parts(file)
-    assert len(made) == 3
+    assert len(made) == 5
 
 
 def test_scale_mirror_and_material_are_those_of_the_record(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import hashlib
 import os
 import tempfile
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,7 +70,8 @@ def light_parts(filename: str) -> tuple[Part, ...]:
     limits = (FORMAT, KEEP, SHARE, FEWEST, MOST, SMALL, SMOOTH, SAMPLES)
     key = hashlib.sha256(f"{limits} {file.resolve()} {status.st_size} {status.st_mtime_ns}".encode()).hexdigest()
     cached = vulkan.cache_folder() / "meshes" / f"{file.stem}-{key[:16]}.npz"
-    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made again
+    # not there yet, or damaged in whatever way: made again
+    with contextlib.suppress(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         return _load(cached)
     parts = _make(filename)
     _save(cached, parts)

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_cpm.envs.maniskill_checks import choose_renderer
+
 #: Metres of motion that an action of 1 asks for (pd_ee_delta_pose and pd_ee_delta_pos)
 REACH = 0.1
 OPEN, CLOSED = 1.0, -1.0
@@ -63,12 +65,16 @@ def record(folder: str | Path, n_episodes: int = 10, seed: int = 0, **env_kwargs
     :param seed: seed of the first episode; the others count on from it
     :param env_kwargs: for ``gym.make``, for instance ``robot_uids`` and ``control_mode`` of the training environment
     :return: the ``.h5`` file
+    :raises RuntimeError: if pictures are asked for and this machine has no renderer, with the cure
     """
+    env_kwargs = {"obs_mode": "state", "control_mode": "pd_ee_delta_pose", "robot_uids": "panda_wristcam", **env_kwargs}
+    if "render_backend" not in env_kwargs:  # before SAPIEN is imported: the renderer may be one of our own
+        env_kwargs["render_backend"] = choose_renderer("PickCube-v1", env_kwargs["obs_mode"]).backend
+
     import gymnasium as gym
     import mani_skill.envs  # noqa: F401  # registers the tasks
     from mani_skill.utils.wrappers.record import RecordEpisode
 
-    env_kwargs = {"obs_mode": "state", "control_mode": "pd_ee_delta_pose", "robot_uids": "panda_wristcam", **env_kwargs}
     env = RecordEpisode(
         gym.make("PickCube-v1", sim_backend="physx_cpu", **env_kwargs),
         str(folder),
