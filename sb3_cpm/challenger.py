@@ -17,7 +17,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
-from sb3_cpm.presets import make_preset
+from sb3_cpm.presets import make_preset, plain
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes
@@ -27,7 +27,7 @@ from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imaginatio
 from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, read_file, write_file
 from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 from sb3_cpm.world_model.networks import MLP
-from sb3_cpm.world_model.observations import UINT8_RANGE, Inputs, ObservationSpec, check_action_space, to_tensor
+from sb3_cpm.world_model.observations import Inputs, ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.open_loop import OpenLoop, open_loop
 from sb3_cpm.world_model.optimizer import ADVICE, Gradients, Optimizer
 from sb3_cpm.world_model.rssm import LatentState
@@ -40,7 +40,7 @@ class Challenger:
     """
     World model, uncertainty and exploration behaviour, with everything that trains them.
 
-    :param observation_space: Dict space; images (3-D, of uint8 or with finite bounds) and vectors (1-D) are read
+    :param observation_space: Dict space; images (3-D, with finite bounds) and vectors (1-D) are read
     :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
     :param device: "auto" takes the GPU where there is one
     :param preset: "default", "report", or a dict of entries, see :mod:`sb3_cpm.presets`
@@ -76,7 +76,7 @@ class Challenger:
 
         self.world_model = WorldModel(self.spec, self.action_dim, self.preset).to(self.device)
         self.uncertainty_name, kind, defaults = self._uncertainty_class(uncertainty_class)
-        self.uncertainty_kwargs = {**defaults, **(uncertainty_kwargs or {})}
+        self.uncertainty_kwargs: dict[str, Any] = plain({**defaults, **(uncertainty_kwargs or {})})
         model = self.world_model
         sizes = LatentSizes(
             model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim, model.latent.one_hot
@@ -447,9 +447,9 @@ class Challenger:
         :raises ValueError: if it reads others, has other sizes (naming the first mismatch) or another measure of uncertainty;
             nothing is changed then
         """
-        theirs, ours = other._config(), self._config()
-        if list(theirs["keys"].items()) != list(ours["keys"].items()):
-            raise ValueError(f"The one to start from reads the observations {theirs['keys']}, this one reads {ours['keys']}.")
+        theirs, ours = other._config()["keys"], self._config()["keys"]
+        if not _same_observations(theirs, ours):
+            raise ValueError(f"The one to start from reads the observations {theirs}, this one reads {ours}.")
         names = tuple(name for name in self.networks if name in other.networks)
         if "uncertainty" in names and self.uncertainty_name != other.uncertainty_name:
             raise ValueError(
@@ -482,7 +482,8 @@ class Challenger:
 
     def load_state(self, path: str | os.PathLike, restore_rng: bool = False) -> None:
         """
-        Take over what :meth:`save` wrote, in a challenger that was built for the same spaces and preset.
+        Take over what :meth:`save` wrote, in a challenger that was built for the same spaces and preset. Where its preset has
+        another learning rate than the saved one's, it keeps its own.
 
         :param path: of the file
         :param restore_rng: also set torch's global random state
@@ -490,9 +491,15 @@ class Challenger:
         """
         content = read_file(path, self.device)
         theirs, ours = content["config"]["keys"], self._config()["keys"]
-        if list(theirs.items()) != list(ours.items()):
+        if not _same_observations(theirs, ours):
             raise ValueError(f"{path} was saved for the observations {theirs}, this challenger reads {ours}.")
         self.load_state_dict(content["state"], restore_rng)
+        saved = content["config"]["preset"]
+        for name, optimizer in self.optimizers.items():
+            entry = rate_entry(name)
+            if self.preset[entry] != saved[entry]:  # otherwise the file's, which a schedule may have changed
+                for group in optimizer.adam.param_groups:
+                    group["lr"] = self.preset[entry]
 
     def _config(self) -> dict[str, Any]:
         """Plain data only: files are read without executing anything in them."""
@@ -500,8 +507,8 @@ class Challenger:
             key: {"shape": list(self.spec.shapes[key]), "image": key in self.spec.image_keys} for key in self.keys
         }
         for key, limits in self.spec.ranges.items():
-            if limits != UINT8_RANGE:
-                keys[key]["range"] = list(limits)
+            if not self.spec.is_full_uint8(key):  # what is not written is uint8 from 0 to 255
+                keys[key].update(range=list(limits), dtype=self.spec.dtypes[key])
         action = {"low": self.action_space.low.tolist(), "high": self.action_space.high.tolist()}
         return {
             "keys": keys,
@@ -550,10 +557,39 @@ class Challenger:
 _NO_EXPLORATION = "This challenger has no {}: it was built with the preset entry 'train_exploration_behavior': False."
 
 
+def rate_entry(optimizer: str) -> str:
+    """
+    :param optimizer: name of one of a challenger's optimizers
+    :return: the preset entry that has its learning rate
+    """
+    return {"world_model": "model_lr", "uncertainty": "uncertainty_lr"}.get(optimizer, f"{optimizer.split('_')[-1]}_lr")
+
+
+def _same_observations(theirs: Mapping[str, Mapping[str, Any]], ours: Mapping[str, Mapping[str, Any]]) -> bool:
+    """
+    Whether two configurations read the same keys in the same way. Of dtypes only uint8 matters, everything else is read as
+    float32: files from before the dtype was written, where it was none, fit as well.
+    """
+
+    def comparable(keys: Mapping[str, Mapping[str, Any]]) -> list[tuple[Any, ...]]:
+        return [
+            (
+                key,
+                tuple(entry["shape"]),
+                entry["image"],
+                entry.get("dtype") == "uint8",
+                tuple(float(np.float32(limit)) for limit in entry.get("range", ())),
+            )
+            for key, entry in keys.items()
+        ]
+
+    return comparable(theirs) == comparable(ours)
+
+
 def _space(entry: Mapping[str, Any]) -> spaces.Box:
     if "range" in entry:
         low, high = entry["range"]
-        return spaces.Box(low, high, tuple(entry["shape"]), np.float32)
+        return spaces.Box(low, high, tuple(entry["shape"]), np.dtype(entry.get("dtype", "float32")).type)
     if entry["image"]:
         return spaces.Box(0, 255, tuple(entry["shape"]), np.uint8)
     return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)

@@ -10,8 +10,11 @@ differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.cha
 """
 
 import difflib
-from collections.abc import Iterable, Mapping
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
 
 REPORT: dict[str, Any] = {
     # what train() is fed with
@@ -124,13 +127,50 @@ CHALLENGES: dict[str, dict[str, Any]] = {
     },
 }
 
-_POSITIVE_INTEGERS = [
-    key for key in REPORT if key.endswith(("_size", "_length", "_units", "_classes", "_every")) or key.startswith("cnn_")
-] + ["horizon"]
-_CHOICES: dict[str, tuple[Any, ...]] = {
-    "latent": ("gaussian", "categorical"),
-    "actor_gradient": ("dynamics", "reinforce", "both"),
-    **{key: (True, False) for key, value in REPORT.items() if isinstance(value, bool)},
+
+class _Rule(NamedTuple):
+    """What a preset entry must be, in words and as a test."""
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+def _integer(least: int) -> _Rule:
+    return _Rule(
+        f"an integer of at least {least}",
+        lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least,
+    )
+
+
+def _number(words: str, holds: Callable[[float], bool]) -> _Rule:
+    return _Rule(words, lambda value: isinstance(value, (int, float)) and not isinstance(value, bool) and holds(value))
+
+
+def _choice(*valid: Any) -> _Rule:
+    return _Rule(f"one of {valid}", lambda value: value in valid)
+
+
+_SHARE = _number("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)
+_AT_LEAST_0 = _number("a finite number of at least 0", lambda value: 0.0 <= value < math.inf)
+_ABOVE_0 = _number("a number above 0", lambda value: value > 0.0)
+_RULES: dict[str, _Rule] = {
+    **{key: _choice(True, False) for key, value in REPORT.items() if isinstance(value, bool)},
+    **{key: _integer(1) for key in REPORT if key.endswith(("_size", "_units", "_classes", "_every"))},
+    **{key: _integer(0) for key in REPORT if key.endswith("_layers")},  # an MLP may consist of its output layer
+    **{key: _integer(1) for key in ("cnn_depth", "cnn_layers", "horizon")},
+    **{key: _AT_LEAST_0 for key in REPORT if key.endswith(("_lr", "_scale"))},
+    "sequence_length": _integer(2),  # a transition has two rows
+    "imagination_starts": _Rule(f"None or {_integer(1).words}", lambda value: value is None or _integer(1).holds(value)),
+    "latent": _choice("gaussian", "categorical"),
+    "actor_gradient": _choice("dynamics", "reinforce", "both"),
+    **{key: _SHARE for key in ("gamma", "lambda_", "kl_balance", "reinforce_share", "weight_decay")},
+    "free_nats": _AT_LEAST_0,
+    "adam_eps": _ABOVE_0,
+    "grad_clip": _ABOVE_0,
+    "uncertainty": _Rule(
+        "a dict of dicts of arguments, by the name of the uncertainty class",
+        lambda value: isinstance(value, dict) and all(isinstance(one, dict) for one in value.values()),
+    ),
 }
 
 
@@ -140,7 +180,8 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
 
     :param preset: name of a preset, or the entries that differ from "default"
     :param overrides: further entries, they win
-    :raises ValueError: for unknown names (with the nearest valid one), sizes that are no positive integers, unknown choices
+    :return: plain Python numbers: NumPy's scalars would make a saved file unreadable
+    :raises ValueError: for unknown names (with the nearest valid one), and values that cannot work, saying what they must be
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
@@ -153,18 +194,25 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     for key in overrides:
         if key not in result:
             raise ValueError(f"Unknown preset entry {key!r}.{nearest(key, result, cutoff=0.0)} Valid: {sorted(result)}.")
-    result.update(overrides)
-    for key in _POSITIVE_INTEGERS:
-        if not isinstance(result[key], int) or isinstance(result[key], bool) or result[key] < 1:
-            raise ValueError(f"Preset entry {key!r} must be an integer of at least 1, got {result[key]!r}.")
-    for key, valid in _CHOICES.items():
-        if result[key] not in valid:
-            raise ValueError(f"Preset entry {key!r}: `{key}` must be one of {valid}, got {result[key]!r}.")
-    if not 0.0 <= result["reinforce_share"] <= 1.0:
-        raise ValueError(f"Preset entry 'reinforce_share' must lie between 0 and 1, got {result['reinforce_share']!r}.")
-    if result["sequence_length"] < 2:
-        raise ValueError("Preset entry 'sequence_length' must be at least 2: a transition has two rows.")
+    result = plain({**result, **overrides})
+    for key, rule in _RULES.items():
+        if not rule.holds(result[key]):
+            raise ValueError(f"Preset entry {key!r} must be {rule.words}, got {result[key]!r}.")
     return result
+
+
+def plain(value: Any) -> Any:
+    """
+    :param value: a number, or dicts, lists and tuples of them
+    :return: the same with Python's numbers in place of NumPy's scalars; everything else stays what it is
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(plain(one) for one in value)
+    return value
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.4) -> str:

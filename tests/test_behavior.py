@@ -179,9 +179,9 @@ def test_save_load_train_is_train(kind: str, tmp_path: Any) -> None:
 @pytest.mark.parametrize(
     "entries, message",
     [
-        ({"actor_gradient": "pathwise"}, "`actor_gradient` must be one of"),
-        ({"reinforce_share": 1.5}, "'reinforce_share' must lie between 0 and 1"),
-        ({"amp": "yes"}, "`amp` must be one of"),
+        ({"actor_gradient": "pathwise"}, "'actor_gradient' must be one of"),
+        ({"reinforce_share": 1.5}, "'reinforce_share' must be a number from 0 to 1"),
+        ({"amp": "yes"}, "'amp' must be one of"),
     ],
 )
 def test_wrong_entries(entries: dict[str, Any], message: str) -> None:

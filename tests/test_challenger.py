@@ -272,6 +272,33 @@ def test_save_and_load(tmp_path: pathlib.Path) -> None:
         assert np.array_equal(value, weights(loaded)[key]) and np.array_equal(value, weights(other)[key]), key
 
 
+@pytest.mark.parametrize("number", [np.float64, np.float32])
+def test_numpy_scalars_do_not_spoil_the_file(tmp_path: pathlib.Path, number: type) -> None:
+    kwargs = {"mean_range": (number(0.25), 1.5), "heads": np.int64(3)}
+    challenger = small(gamma=number(0.5), uncertainty_kwargs=kwargs)
+    challenger.save(tmp_path / "challenger.pt")
+    loaded = Challenger.load(tmp_path / "challenger.pt", "cpu")
+    assert loaded.preset["gamma"] == 0.5 and loaded.uncertainty_kwargs["mean_range"] == (0.25, 1.5)
+
+
+def test_loading_keeps_learning_rates_that_were_asked_for_anew(tmp_path: pathlib.Path) -> None:
+    """All others are the file's, also where a schedule has moved them away from the preset's."""
+    challenger, path = small(train_task_behavior=True, actor_lr=2e-4), tmp_path / "challenger.pt"
+    for group in challenger.optimizers["task_actor"].adam.param_groups:
+        group["lr"] = 1e-5
+    challenger.train(random_batch(VECTOR, 2))
+    challenger.save(path)
+    other = small(train_task_behavior=True, actor_lr=2e-4, model_lr=1e-6, uncertainty_lr=0.0)
+    other.load_state(path)
+    rates = {name: optimizer.adam.param_groups[0]["lr"] for name, optimizer in other.optimizers.items()}
+    assert (rates["world_model"], rates["uncertainty"]) == (1e-6, 0.0)
+    assert (rates["task_actor"], rates["exploration_actor"], rates["task_critic"]) == (1e-5, 2e-4, other.preset["critic_lr"])
+    other.save(path)
+    again = Challenger.load(path, "cpu")
+    assert again.preset["model_lr"] == again.optimizers["world_model"].adam.param_groups[0]["lr"] == 1e-6
+    assert again.optimizers["task_actor"].adam.param_groups[0]["lr"] == 1e-5
+
+
 def test_a_crash_while_saving_leaves_the_old_file(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "challenger.pt"
     small().save(path)
@@ -335,11 +362,13 @@ def test_an_uncertainty_class_of_ones_own_has_to_be_named_when_loading(tmp_path:
         (VECTOR, spaces.Discrete(3), {}, r"continuous action space \(Box\)"),
         (VECTOR, spaces.Box(-np.inf, np.inf, (2,)), {}, "must be bounded"),
         (VECTOR, spaces.Box(-1, 1, (0,)), {}, "no dimension"),
+        (VECTOR, spaces.Box(np.float32([-1, 0.5]), np.float32([1, 0.5])), {}, r"dimension 1 .* from 0.5 to 0.5.* no room"),
+        (VECTOR, spaces.Box(-3e38, 3e38, (2, 3)), {}, r"dimension \(0, 0\) .* from -3e\+38 .* too wide.*RescaleAction"),
         (spaces.Dict({"a": image(32), "b": image(64)}), box(2), {}, "a: 32x32, b: 64x64"),
         (spaces.Dict({"camera": image(84)}), box(2), {}, "84x84 pixels cannot be halved"),
         (spaces.Dict({"d": spaces.Discrete(3)}), box(2), {}, "No observation key is usable"),
         (VECTOR, box(2), {"horizn": 3}, "Did you mean 'horizon'"),
-        (VECTOR, box(2), {"latent": "uniform"}, "`latent` must be"),
+        (VECTOR, box(2), {"latent": "uniform"}, "'latent' must be"),
         (VECTOR, box(2), {"uncertainty_class": "rnd2"}, "Unknown uncertainty class"),
         (VECTOR, box(2), {"uncertainty_class": int}, "subclass of Uncertainty"),
     ],

@@ -82,6 +82,46 @@ def test_images_in_a_declared_range_are_scaled_by_it(tmp_path: pathlib.Path) -> 
         other.load_state(tmp_path / "challenger.pt")
 
 
+@pytest.mark.parametrize(
+    "dtype, high", [(np.uint8, 1), (np.uint8, 255), (np.float32, 255), (np.int32, 255), (np.float32, 0.7), (np.float64, 0.7)]
+)
+def test_images_of_every_dtype_are_saved_and_loaded(tmp_path: pathlib.Path, dtype: type, high: float) -> None:
+    space = spaces.Dict({"camera": spaces.Box(0, high, (8, 8, 3), dtype)})
+    challenger, batch = small(space), random_batch(space, 2)
+    batch.observations["camera"] = (np.random.default_rng(0).integers(0, 2, (8, 4, 8, 8, 3)) * high).astype(dtype)
+    challenger.train(batch)
+    challenger.save(tmp_path / "challenger.pt")
+    entry = torch.load(tmp_path / "challenger.pt")["config"]["keys"]["camera"]
+    assert set(entry) == ({"shape", "image"} if (dtype, high) == (np.uint8, 255) else {"shape", "image", "range", "dtype"})
+    torch.manual_seed(0)
+    expected = challenger.train(batch)
+    for how in ("load", "load_state", "adopt"):
+        loaded = Challenger.load(tmp_path / "challenger.pt", "cpu") if how != "load_state" else small(space)
+        if how == "load_state":
+            loaded.load_state(tmp_path / "challenger.pt")
+        elif how == "adopt":
+            source, loaded = loaded, small(space)
+            loaded.adopt(source)
+        assert loaded.observation_space == space
+        torch.manual_seed(0)
+        assert loaded.train(batch) == expected, how
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_files_from_before_the_dtype_was_saved(tmp_path: pathlib.Path, dtype: type) -> None:
+    """They fit an environment whose images are declared with the same bounds, but not one with uint8."""
+    challenger, path = small(spaces.Dict({"depth": spaces.Box(0, 0.7, (8, 8, 1), dtype)})), tmp_path / "challenger.pt"
+    challenger.save(path)
+    content = torch.load(path)
+    del content["config"]["keys"]["depth"]["dtype"]
+    torch.save(content, path)
+    old = Challenger.load(path, "cpu")
+    challenger.load_state(path)
+    challenger.adopt(old)
+    with pytest.raises(ValueError, match="was saved for the observations"):
+        small(spaces.Dict({"depth": spaces.Box(0, 1, (8, 8, 1), np.uint8)})).load_state(path)
+
+
 @pytest.mark.parametrize("value", [3.5, -1.5, np.nan])
 def test_images_outside_of_their_declared_range(value: float) -> None:
     depth = np.zeros((2, 32, 32, 1), np.float32)

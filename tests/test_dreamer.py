@@ -1,5 +1,7 @@
 """Dreamer and Plan2Explore as SB3 algorithms: acting, latent state, learning, saving, callbacks, wrappers, bad input."""
 
+from copy import deepcopy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from sb3_cpm.dreamer import Dreamer, DreamerPolicy, Plan2Explore
 from sb3_cpm.dreamer.spaces import OBSERVATION
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.presets import DEFAULT
+from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
 
 TINY = dict(
     batch_size=4, sequence_length=12, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=16, hidden_size=16, head_units=16,
@@ -321,10 +324,44 @@ def test_scalars_are_logged(tmp_path):
     assert list(tmp_path.glob("events*"))
 
 
-def test_a_learning_rate_schedule_moves_all_learning_rates():
-    def rates(model):
-        return {name: one.adam.param_groups[0]["lr"] for name, one in model.challenger.optimizers.items()}
+class Sampling(gym.Env):
+    """Observes samples of a space."""
 
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, observation_space: spaces.Space, length: int = 7) -> None:
+        self.observation_space, self.length = deepcopy(observation_space), length  # VecNormalize changes it
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return self.observation_space.sample(), float(action.sum()), False, self.n_steps == self.length, {}
+
+
+LONG = {
+    "a_name_with_27_characters__": "a_name_with_27_characters__",
+    "robot0_left_fingers_joint_positions": "robot0_l..._joint_positions",
+    "robot0_left_gripper_joint_positions": "robot0_..2..joint_positions",
+    "robot0_left_gripper_joint_velocities": "robot0_l...joint_velocities",
+}
+
+
+def test_long_keys_get_names_that_a_printed_log_can_tell_apart(capsys):
+    space = spaces.Dict({key: spaces.Box(-1, 1, (3,)) for key in LONG})
+    make(Sampling(space), learning_starts=10, verbose=1).learn(40, log_interval=1)
+    printed = capsys.readouterr().out
+    assert all(f"   error_{name} |" in printed for name in LONG.values())
+
+
+def rates(model):
+    return {name: one.adam.param_groups[0]["lr"] for name, one in model.challenger.optimizers.items()}
+
+
+def test_a_learning_rate_schedule_moves_all_learning_rates():
     plain = make(kind=Plan2Explore).learn(200)
     assert rates(plain)["world_model"] == plain.learning_rate == DEFAULT["model_lr"]
     assert rates(plain)["exploration_actor"] == DEFAULT["actor_lr"]
@@ -338,6 +375,20 @@ def test_a_learning_rate_schedule_moves_all_learning_rates():
         ("uncertainty_lr", "uncertainty"),
     ):
         assert now[name] == pytest.approx(now["world_model"] * DEFAULT[entry] / DEFAULT["model_lr"])
+
+
+def test_a_frozen_world_model():
+    explorer = counting(kind=Plan2Explore).learn(60)
+    frozen = {"model_lr": 0.0, "weight_decay": 0.0}
+    arguments = dict(policy="MlpPolicy", env=Counting(), start_from=explorer, device="cpu", learning_starts=10)
+    model = Dreamer(**arguments, preset=frozen)
+    task = part(model.challenger, "task").detach().clone()
+    model.learn(30)
+    assert rates(model) == {"world_model": 0.0, "task_actor": DEFAULT["actor_lr"], "task_critic": DEFAULT["critic_lr"]}
+    assert th.equal(part(model.challenger, "world_model"), part(explorer.challenger, "world_model"))
+    assert model._n_updates > 0 and not th.equal(part(model.challenger, "task"), task)
+    with pytest.raises(ValueError, match="'model_lr' is 0, .*`learning_rate`.*leave one of them out"):
+        Dreamer(**arguments, preset=frozen, learning_rate=1e-3)
 
 
 # ---- exploring -----------------------------------------------------------------------------------------------------------
@@ -442,6 +493,40 @@ def test_an_explorer_goes_on_from_an_explorer():
         assert th.equal(part(first.challenger, name), part(second.challenger, name)), name
     with pytest.raises(ValueError, match="rnd"):
         make(kind=Plan2Explore, start_from=first, uncertainty_class="rnd")
+
+
+class Own(UNCERTAINTY_CLASSES["rnd"]):
+    """A class of one's own."""
+
+
+@pytest.mark.parametrize("kind", [None, "rnd", Own])
+@pytest.mark.parametrize("saved", [True, False])
+def test_an_explorer_takes_over_uncertainty_and_its_arguments(tmp_path, kind, saved):
+    kwargs = {"units": 12, "scale_factor": 1.25}
+    first = counting(kind=Plan2Explore, uncertainty_class=kind, uncertainty_kwargs=kwargs).learn(30)
+    first.save(tmp_path / "first.zip")
+    source = tmp_path / "first.zip" if saved else first
+    arguments = dict(policy="MlpPolicy", env=Counting(), start_from=source, device="cpu")
+    second = Plan2Explore(**arguments).challenger
+    assert second.uncertainty_name == first.challenger.uncertainty_name
+    assert second.uncertainty_kwargs == first.challenger.uncertainty_kwargs
+    assert th.equal(part(second, "uncertainty"), part(first.challenger, "uncertainty"))
+    third = Plan2Explore(**arguments, uncertainty_kwargs={"metric": "log"}).challenger
+    assert third.uncertainty.metric == "log" and third.uncertainty_kwargs["units"] == 12
+    name = first.challenger.uncertainty_name
+    fourth = Plan2Explore(**arguments, preset={"uncertainty": {name: {"scale_factor": 1.125}}}).challenger
+    assert kind is Own or fourth.uncertainty.rule.factor == 1.125, "what is given wins"
+    with pytest.raises(ValueError, match="other sizes"):
+        Plan2Explore(**arguments, uncertainty_kwargs={"units": 13})
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_file_fits_the_environment_that_it_comes_from(tmp_path, dtype):
+    env = Sampling(spaces.Box(0.0, 0.7, (8, 8, 3), dtype))
+    first = make(env, policy="CnnPolicy")
+    first.challenger.save(tmp_path / "challenger.pt")
+    second = Dreamer("CnnPolicy", env, start_from=tmp_path / "challenger.pt", device="cpu")
+    assert all(np.array_equal(value, weights(second)[key]) for key, value in weights(first).items())
 
 
 def test_learning_offline_from_an_explorers_buffer(tmp_path):
@@ -589,6 +674,52 @@ def test_what_acts_and_what_learns_see_the_same_normalized_observations(box):
     assert (seen.rewards[raw.is_first] == 0).all()
     assert np.array_equal(raw.observations["state"], original)
     evaluate_policy(model, env, 1, warn=False)
+
+
+MIXED = spaces.Dict(
+    {
+        "state": spaces.Box(-1, 1, (3,), np.float32),
+        "other": spaces.Box(-1, 1, (2,), np.float32),
+        "depth": spaces.Box(0, 1, (8, 8, 1), np.float32),
+        "camera": spaces.Box(0, 255, (3, 8, 8), np.uint8),
+    }
+)
+
+
+@pytest.mark.parametrize(
+    "keys, normalized",
+    [
+        (["state"], None),
+        (["state", "depth"], ["state", "other"]),
+        (["state", "camera"], None),
+        (["depth"], ["other"]),
+    ],
+)
+def test_keys_that_are_not_read_may_be_normalized(keys, normalized):
+    env = VecNormalize(DummyVecEnv([lambda: Sampling(MIXED)]), norm_obs_keys=normalized)
+    model = make(env, keys=keys, learning_starts=20).learn(40)
+    assert model._n_updates > 0
+    raw = model.replay_buffer.sample_sequences(2, 5, model.challenger.keys)
+    seen = model._normalized(raw).observations
+    every = env.normalize_obs(model.replay_buffer.sample_sequences(2, 5).observations)
+    assert set(seen) == set(keys) and all(seen[key].dtype == every[key].dtype for key in keys)
+    unchanged = [key for key in keys if np.array_equal(seen[key], raw.observations[key])]
+    assert unchanged == [key for key in keys if normalized is not None and key not in normalized]
+
+
+@pytest.mark.parametrize(
+    "space, kwargs, message",
+    [
+        (MIXED, {}, r"within \+-10, .*\{'depth': '0 to 1'\}.*norm_obs_keys=\['camera', 'other', 'state'\]"),
+        (MIXED, {"norm_obs_keys": ["depth"]}, "'depth'.*norm_obs=False"),
+        (MIXED["depth"], {}, "norm_obs=False"),
+        (MIXED["depth"], {"clip_obs": 0.5}, r"within \+-0.5"),
+    ],
+)
+def test_images_that_vec_normalize_would_move_out_of_their_range(space, kwargs, message):
+    env = VecNormalize(DummyVecEnv([lambda: Sampling(space)]), **kwargs)
+    with pytest.raises(ValueError, match=message):
+        make(env, policy="MultiInputPolicy" if space is MIXED else "CnnPolicy")
 
 
 # ---- bad input -----------------------------------------------------------------------------------------------------------

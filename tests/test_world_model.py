@@ -82,6 +82,40 @@ def test_observations_of_another_space_are_refused() -> None:
         spec.preprocess({"w": np.zeros((4, 3), np.float32)}, CPU)
 
 
+@pytest.mark.parametrize("dtype, high", [(np.float32, 255), (np.int32, 255), (np.int32, 7), (np.float64, 255), (np.uint8, 1)])
+def test_the_declared_bounds_are_black_and_white_whatever_the_dtype(dtype: type, high: int) -> None:
+    spec = ObservationSpec(spaces.Dict({"camera": spaces.Box(0, high, (4, 4, 3), dtype)}))
+    pictures = np.zeros((2, 4, 4, 3), dtype)
+    pictures[1, :2] = high
+    inputs = spec.preprocess({"camera": pictures}, CPU)
+    assert inputs.images is not None and inputs.images.dtype == torch.float32
+    assert (inputs.images[0] == -0.5).all() and (inputs.images[1, :, :2] == 0.5).all()
+    assert np.array_equal(spec.split(inputs, (2,))["camera"].numpy(), pictures.astype(np.float32))
+
+
+def test_bounds_of_uint8_are_taken_at_their_word() -> None:
+    spec = ObservationSpec(spaces.Dict({"mask": spaces.Box(0, 1, (4, 4, 1), np.uint8), "camera": image(4, 4)}))
+    mask, camera = np.zeros((1, 4, 4, 1), np.uint8), np.full((1, 4, 4, 3), 255, np.uint8)
+    with pytest.raises(ValueError, match=r"'mask' holds values from 0 to 2, its space declares 0 to 1"):
+        spec.preprocess({"mask": mask + np.arange(4, dtype=np.uint8).reshape(4, 1).clip(0, 2), "camera": camera}, CPU)
+    with pytest.raises(ValueError, match=r"'mask' came as torch.float32, its space declares uint8 from 0 to 1"):
+        spec.preprocess({"mask": mask.astype(np.float32), "camera": camera}, CPU)
+    with pytest.raises(ValueError, match="cannot read key 'mask'.*finite bounds"):
+        ObservationSpec(spaces.Dict({"mask": spaces.Box(0, 0, (4, 4, 1), np.uint8)}), ["mask"])
+
+
+def test_rounding_may_leave_the_declared_range_a_little() -> None:
+    """As float16 does, in which a buffer may store images: 0.7 becomes 0.7002."""
+    spec = ObservationSpec(spaces.Dict({"depth": spaces.Box(0.0, 0.7, (4, 4, 1), np.float32)}))
+    depth = np.full((1, 4, 4, 1), np.float16(0.7)).astype(np.float32)
+    assert depth.max() > np.float32(0.7)
+    images = spec.preprocess({"depth": depth}, CPU).images
+    assert images is not None and (images == 0.5).all(), "inputs stay within their range"
+    for wrong in (0.702, -0.002):
+        with pytest.raises(ValueError, match="its space declares 0 to 0.7"):
+            spec.preprocess({"depth": np.full_like(depth, wrong)}, CPU)
+
+
 # ---- networks --------------------------------------------------------------------------------------------------------
 
 
@@ -216,6 +250,15 @@ def test_presets_have_the_same_entries_and_are_copied() -> None:
     assert PRESETS["report"]["gamma"] == 0.99
     assert (PRESETS["report"]["deter_size"], PRESETS["report"]["stoch_size"], PRESETS["report"]["horizon"]) == (200, 50, 15)
     assert make_preset({"horizon": 3}, gamma=0.5)["horizon"] == 3
+    for preset in PRESETS:
+        assert make_preset(preset) == PRESETS[preset]
+
+
+def test_numpy_scalars_become_plain_numbers() -> None:
+    layers = {"rnd": {"layers": np.int8(2)}}
+    preset = make_preset(gamma=np.float64(0.97), horizon=np.int64(3), amp=np.bool_(False), uncertainty=layers)
+    values = preset["gamma"], preset["horizon"], preset["amp"], preset["uncertainty"]["rnd"]["layers"]
+    assert values == (0.97, 3, False, 2) and [type(value) for value in values] == [float, int, bool, int]
 
 
 @pytest.mark.parametrize(
@@ -226,6 +269,23 @@ def test_presets_have_the_same_entries_and_are_copied() -> None:
         ({"deter": 3}, {}, "Did you mean 'deter_size'"),
         ({"deter_size": 0}, {}, "'deter_size' must be an integer of at least 1"),
         ({"sequence_length": 1}, {}, "at least 2"),
+        ({"imagination_starts": 0}, {}, "'imagination_starts' must be None or an integer of at least 1, got 0"),
+        ({"imagination_starts": 8.0}, {}, "'imagination_starts' must be None or an integer"),
+        ({"horizon": True}, {}, "'horizon' must be an integer of at least 1, got True"),
+        ({"cnn_layers": 0}, {}, "'cnn_layers' must be an integer of at least 1"),
+        ({"actor_layers": -1}, {}, "'actor_layers' must be an integer of at least 0, got -1"),
+        ({"head_layers": None}, {}, "'head_layers' must be an integer of at least 0"),
+        ({"gamma": 1.01}, {}, "'gamma' must be a number from 0 to 1, got 1.01"),
+        ({"lambda_": -0.1}, {}, "'lambda_' must be a number from 0 to 1"),
+        ({"kl_balance": math.nan}, {}, "'kl_balance' must be a number from 0 to 1"),
+        ({"reinforce_share": 2}, {}, "'reinforce_share' must be a number from 0 to 1"),
+        ({"model_lr": -1e-3}, {}, "'model_lr' must be a finite number of at least 0"),
+        ({"actor_lr": math.inf}, {}, "'actor_lr' must be a finite number of at least 0"),
+        ({"critic_lr": "3e-4"}, {}, "'critic_lr' must be a finite number of at least 0, got '3e-4'"),
+        ({"free_nats": None}, {}, "'free_nats' must be a finite number of at least 0"),
+        ({"adam_eps": 0.0}, {}, "'adam_eps' must be a number above 0"),
+        ({"grad_clip": 0}, {}, "'grad_clip' must be a number above 0"),
+        ({"uncertainty": {"rnd": 3}}, {}, "'uncertainty' must be a dict of dicts"),
         (3, {}, "must be a name"),
     ],
 )

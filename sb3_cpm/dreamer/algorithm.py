@@ -27,11 +27,11 @@ from stable_baselines3.common.utils import configure_logger
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import check_environment
 from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
-from sb3_cpm.challenger import Challenger, choose_device
+from sb3_cpm.challenger import Challenger, choose_device, rate_entry
 from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
 from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
-from sb3_cpm.dreamer.start import StartFrom, read_challenger
+from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertainty
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
@@ -83,6 +83,14 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             keys = source.keys if keys is None else keys
             preset = {**source.preset, **(preset or {})} if not isinstance(preset, str) else preset
         sizes = make_preset("default" if preset is None else preset, **entries)
+        if learning_rate is not None and sizes["model_lr"] == 0.0:
+            raise ValueError(
+                f"The preset entry 'model_lr' is 0, which keeps the world model from learning, and `learning_rate`, "
+                f"{learning_rate}, is the world model's too: leave one of them out. The other rates are preset entries."
+            )
+        policy_kwargs = {"preset": sizes, "keys": keys, **(policy_kwargs or {}), "behavior": self.behavior}
+        if sizes["train_exploration_behavior"]:
+            policy_kwargs.update(take_over_uncertainty(source, sizes, policy_kwargs))
         super().__init__(
             policy,
             env,
@@ -96,7 +104,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
-            policy_kwargs={"preset": sizes, "keys": keys, **(policy_kwargs or {}), "behavior": self.behavior},
+            policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -128,6 +136,30 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             self.replay_buffer = self._make_replay_buffer()
         self.policy_kwargs["device"] = str(self.device)
         super()._setup_model()
+        self._check_normalized_images()
+
+    def _check_normalized_images(self) -> None:
+        """
+        VecNormalize declares what it returns for uint8 from 0 to 255 only; other images would leave the range they declare.
+
+        :raises ValueError: naming the images, and what to do
+        """
+        env, spec = self._vec_normalize_env, self.challenger.spec
+        if env is None or not env.norm_obs:
+            return
+        keys = list(spec.keys) if env.norm_obs_keys is None else env.norm_obs_keys  # None: the observation is a Box
+        moved = {
+            key: f"{low:g} to {high:g}"
+            for key, (low, high) in spec.ranges.items()
+            if key in keys and not low <= -env.clip_obs < env.clip_obs <= high
+        }
+        if moved:
+            others = [key for key in keys if key not in moved]
+            raise ValueError(
+                f"VecNormalize turns images into values within +-{env.clip_obs:g}, where their space declares {moved}. The "
+                "model scales images by these bounds, so leave them as they are: VecNormalize(..., "
+                f"{f'norm_obs_keys={others}' if others else 'norm_obs=False'})."
+            )
 
     def _make_replay_buffer(self) -> EpisodeBuffer:
         kind: Any = self.replay_buffer_class or CPMBuffer
@@ -247,14 +279,18 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def _adapt_learning_rates(self) -> None:
-        """The world model's follows the schedule, all others keep the preset's ratio to it."""
+        """
+        The world model's follows the schedule, all others keep the preset's ratio to it. Where the preset freezes the world
+        model there is no such ratio, and the others keep the preset's rates.
+        """
         rate = self.lr_schedule(self._current_progress_remaining)
-        self.logger.record("train/learning_rate", rate)
         preset = self.challenger.preset
+        frozen = preset["model_lr"] == 0.0
+        self.logger.record("train/learning_rate", 0.0 if frozen else rate)
         for name, optimizer in self.challenger.optimizers.items():
-            entry = {"world_model": "model_lr", "uncertainty": "uncertainty_lr"}.get(name, f"{name.split('_')[-1]}_lr")
+            own = preset[rate_entry(name)]
             for group in optimizer.adam.param_groups:
-                group["lr"] = rate * preset[entry] / preset["model_lr"]
+                group["lr"] = own if frozen else rate * own / preset["model_lr"]
 
     def _normalized(self, batch: SequenceBatch) -> SequenceBatch:
         """The buffer holds what the environment gave; behind a VecNormalize, what acts sees normalized observations."""
@@ -264,7 +300,10 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         observations: Any = batch.observations
         normalized: Any
         if isinstance(self.observation_space, spaces.Dict):
-            normalized = env.normalize_obs(observations)
+            # it wants to see every key that it normalizes, sampled are those that are read
+            rest = {key: statistics.mean for key, statistics in env.obs_rms.items()} if env.norm_obs else {}
+            every: Any = env.normalize_obs({**rest, **observations})
+            normalized = {key: every[key] for key in observations}
         else:
             normalized = {OBSERVATION: env.normalize_obs(observations[OBSERVATION])}
         return batch._replace(observations=normalized, rewards=env.normalize_reward(batch.rewards))

@@ -42,8 +42,8 @@ class Plan2Explore(DreamerAlgorithm):
     :param replay_buffer_class: as for Dreamer
     :param replay_buffer_kwargs: as for Dreamer
     :param uncertainty_class: what is new: "plan2explore", "rnd", "prediction_error", "observation_ensemble" or a subclass of
-        :class:`~sb3_cpm.uncertainty.base.Uncertainty`
-    :param uncertainty_kwargs: its arguments, on top of the preset's
+        :class:`~sb3_cpm.uncertainty.base.Uncertainty`. By default that of ``start_from``, "plan2explore" where there is none
+    :param uncertainty_kwargs: its arguments, on top of the preset's and of those of ``start_from``
     :param train_task_behavior: also learn a behaviour for the task
     :param preset: as for Dreamer
     :param keys: as for Dreamer
@@ -73,7 +73,7 @@ class Plan2Explore(DreamerAlgorithm):
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
-        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_class: str | type[Uncertainty] | None = None,
         uncertainty_kwargs: Mapping[str, Any] | None = None,
         train_task_behavior: bool = False,
         preset: str | Mapping[str, Any] | None = None,

@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -9,6 +10,7 @@ import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
 
 
 class HasChallenger(Protocol):
@@ -42,6 +44,27 @@ def read_challenger(source: StartFrom, device: th.device) -> Challenger:
     if not path.exists() and path.with_name(f"{path.name}.zip").exists():
         path = path.with_name(f"{path.name}.zip")
     return _from_model(path, device) if _is_model(path) else Challenger.load(path, device)
+
+
+def take_over_uncertainty(source: Challenger | None, preset: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Uncertainty class and arguments: those of the one to start from, but for what is given.
+
+    :param source: the one to start from
+    :param preset: of the new one
+    :param given: may have "uncertainty_class" and "uncertainty_kwargs", None where the user gave none
+    :return: the same two entries, to build the new one with
+    """
+    kind, kwargs = given.get("uncertainty_class"), given.get("uncertainty_kwargs")
+    if source is None or not source.explores:
+        return {"uncertainty_class": kind or "plan2explore", "uncertainty_kwargs": kwargs}
+    name = source.uncertainty_name
+    theirs: str | type = name if name in UNCERTAINTY_CLASSES else type(source.uncertainty)
+    if kind not in (None, theirs):
+        return {"uncertainty_class": kind, "uncertainty_kwargs": kwargs}
+    # what the source was built with has its preset's arguments in it already; those of another preset are newer
+    changed = preset["uncertainty"].get(name, {}) if preset["uncertainty"] != source.preset["uncertainty"] else {}
+    return {"uncertainty_class": theirs, "uncertainty_kwargs": {**source.uncertainty_kwargs, **changed, **(kwargs or {})}}
 
 
 def _is_model(path: Path) -> bool:

@@ -133,6 +133,9 @@ class ActorCritic(nn.Module):
         """
         Let the actor act in the world model for ``horizon`` steps.
 
+        The actor reads latents that carry a gradient, so that returns have their exact one, also through the choice of later
+        actions. The code of Dreamer V1, V2 and sheeprl stops it at the actor's input; the two have not been compared.
+
         :param world_model: supplies the dynamics; its weights get no gradient
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """

@@ -55,9 +55,8 @@ class ObservationSpec:
     The observation keys that the world model reads, sorted by kind.
 
     An *image* is a 3-D Box, channel-last ``(H, W, C)`` or channel-first ``(C, H, W)`` (the channels are the smallest
-    dimension, as in SB3), of uint8 or with finite bounds, which then say what is black and what is white; a *vector* is a 1-D
-    Box. A point cloud (2-D float Box) is read only when ``keys``
-    names it; it is then flattened to one long vector.
+    dimension, as in SB3), of any dtype with finite bounds, which say what is black and what is white; a *vector* is a 1-D Box.
+    A point cloud (2-D float Box) is read only when ``keys`` names it; it is then flattened to one long vector.
 
     :param observation_space: Dict space as SB3's VecEnv gives it
     :param keys: the keys to read; all images and vectors by default
@@ -79,7 +78,9 @@ class ObservationSpec:
         self.shapes: dict[str, tuple[int, ...]] = {key: tuple(observation_space[key].shape or ()) for key in self.keys}
         #: values that become -0.5 and 0.5, for every image
         self.ranges = {key: image_range(observation_space[key]) or UINT8_RANGE for key in self.image_keys}
-        self.scaled_alike = set(self.ranges.values()) == {UINT8_RANGE}
+        #: names of the dtypes of all images
+        self.dtypes = {key: str(observation_space[key].dtype) for key in self.image_keys}
+        self.scaled_alike = all(self.is_full_uint8(key) for key in self.image_keys)
         self.image_shape = self._image_shape()
         self.vector_sizes = [int(np.prod(self.shapes[key])) for key in self.vector_keys]
         self.vector_dim = sum(self.vector_sizes)
@@ -90,7 +91,7 @@ class ObservationSpec:
             chosen = [key for key, sub in space.items() if is_image(sub) or is_vector(sub)]
             if not chosen:
                 raise ValueError(
-                    "No observation key is usable by the challenger: it reads images (3-D Box of uint8 or with finite bounds) "
+                    "No observation key is usable by the challenger: it reads images (3-D Box with finite bounds) "
                     f"and vectors (1-D Box), the space has { {key: str(sub) for key, sub in space.items()} }. A point cloud "
                     "is read if `keys` names it."
                 )
@@ -126,6 +127,10 @@ class ObservationSpec:
         height, width = sizes[self.image_keys[0]]
         return sum(self.channels), height, width
 
+    def is_full_uint8(self, key: str) -> bool:
+        """Whether an image is of the common kind, uint8 from 0 to 255."""
+        return self.dtypes[key] == "uint8" and self.ranges[key] == UINT8_RANGE
+
     def _channel_first(self, key: str) -> bool:
         shape = self.shapes[key]
         return int(np.argmin(shape)) == 0 and shape[0] != shape[-1]
@@ -141,7 +146,7 @@ class ObservationSpec:
         :param observations: each of shape ``(*batch, *observation_shape)``; all batch dimensions are flattened
         :param device: where the inputs shall live
         :return: inputs of ``prod(batch)`` states
-        :raises ValueError: for a missing key or an array of another shape than the space's
+        :raises ValueError: for a missing key, an array of another shape than the space's, and images that are not as declared
         """
         tensors = {key: self._flat_batch(key, observations, device) for key in self.keys}
         images = vectors = None
@@ -169,10 +174,11 @@ class ObservationSpec:
                 f"Observation {key!r} has shape {tuple(tensor.shape)}, expected it to end in {shape}: the observation space "
                 "is not the one that the challenger was built for."
             )
-        if key in self.ranges and self.ranges[key] == UINT8_RANGE and tensor.dtype != torch.uint8:
+        if self.dtypes.get(key) == "uint8" and tensor.dtype != torch.uint8:
+            low, high = self.ranges[key]
             raise ValueError(
-                f"Image {key!r} came as {tensor.dtype}, its space declares uint8 from 0 to 255. Has a wrapper scaled it? "
-                "Leave the image as it is (the player has normalize_images), or declare what the wrapper returns."
+                f"Image {key!r} came as {tensor.dtype}, its space declares uint8 from {low:g} to {high:g}. Has a wrapper "
+                "scaled it? Leave the image as it is (the player has normalize_images), or declare what the wrapper returns."
             )
         return tensor.reshape(-1, *shape)
 
@@ -181,12 +187,15 @@ class ObservationSpec:
         if self.scaled_alike:
             return image
         low, high = self.ranges[key]
-        if image.dtype != torch.uint8 and not (image.amin() >= low and image.amax() <= high):  # in this form NaN is caught too
-            raise ValueError(
-                f"Image {key!r} holds values from {image.amin():.4g} to {image.amax():.4g}, its space declares {low:g} to "
-                f"{high:g}. Correct the space's bounds, or clip the image in a wrapper."
-            )
-        return (image.float() - low) / (high - low) - 0.5
+        image = image.float()
+        if not self.is_full_uint8(key):
+            slack = RANGE_TOLERANCE * (high - low)
+            if not (image.amin() >= low - slack and image.amax() <= high + slack):  # in this form NaN is caught too
+                raise ValueError(
+                    f"Image {key!r} holds values from {image.amin():.4g} to {image.amax():.4g}, its space declares {low:g} to "
+                    f"{high:g}. Correct the space's bounds, or clip the image in a wrapper."
+                )
+        return ((image - low) / (high - low) - 0.5).clamp_(-0.5, 0.5)
 
     def channels_last(self, key: str, images: torch.Tensor) -> torch.Tensor:
         """
@@ -236,15 +245,17 @@ class ObservationSpec:
 
 
 UINT8_RANGE = (0.0, 255.0)
+RANGE_TOLERANCE = 1e-3  # by this share of its range an image may leave it: a buffer that stores images small rounds them
 GREATEST_RANGE = 2.0**32  # bounds wider than that (the limits of float32, say) tell nothing about an image
 RANGELESS = (
-    "{space} looks like an image, but has no finite bounds, so nothing says what is black and what is white. Let the "
-    "environment return uint8, or declare the bounds, as Box(0.0, 1.0, shape), with gymnasium's TransformObservation."
+    "{space} looks like an image, but has no finite bounds with room between them, so nothing says what is black and what is "
+    "white. Let the environment return uint8, or declare the bounds, as Box(0.0, 1.0, shape), with gymnasium's "
+    "TransformObservation."
 )
 
 
 def is_image(space: spaces.Space) -> bool:
-    """3-D Box of uint8 or with finite bounds."""
+    """3-D Box with finite bounds."""
     return is_3d(space) and image_range(space) is not None
 
 
@@ -253,15 +264,13 @@ def is_3d(space: spaces.Space) -> bool:
 
 
 def is_rangeless_image(space: spaces.Space) -> bool:
-    """3-D Box of other numbers than uint8, without finite bounds."""
+    """3-D Box without finite bounds."""
     return is_3d(space) and image_range(space) is None
 
 
 def image_range(space: spaces.Space) -> tuple[float, float] | None:
     """Smallest and greatest value of a 3-D Box; None where it has no bounds, or none that leave room for an image."""
     assert isinstance(space, spaces.Box)
-    if space.dtype == np.uint8:
-        return UINT8_RANGE
     low, high = float(space.low.min()), float(space.high.max())
     return (low, high) if 0.0 < high - low <= GREATEST_RANGE else None
 
@@ -278,7 +287,7 @@ def is_cloud(space: spaces.Space) -> bool:
 
 def check_action_space(space: spaces.Space) -> None:
     """
-    :raises ValueError: unless it is a bounded Box
+    :raises ValueError: unless it is a bounded Box with room to act in every dimension
     """
     if not isinstance(space, spaces.Box):
         raise ValueError(f"The challenger needs a continuous action space (Box), got {space}.")
@@ -288,4 +297,21 @@ def check_action_space(space: spaces.Space) -> None:
         raise ValueError(
             f"The action space must be bounded on both sides, got {space}. Rescale it, for example with "
             "gymnasium.wrappers.RescaleAction, or state the bounds that the environment clips to."
+        )
+    with np.errstate(over="ignore"):
+        width = space.high.astype(np.float32) - space.low.astype(np.float32)  # actions are scaled to [-1, 1] by it
+    for place in np.argwhere(~((width > 0.0) & np.isfinite(width))):
+        index = tuple(place.tolist())
+        bounds = (
+            f"The action space's dimension {index[0] if len(index) == 1 else index} is bounded from {space.low[index]:g} to "
+            f"{space.high[index]:g}"
+        )
+        if width[index] > 0.0:
+            raise ValueError(
+                f"{bounds}, which is too wide to be scaled to [-1, 1]. Rescale it, for example with "
+                "gymnasium.wrappers.RescaleAction, or state the bounds that the environment clips to."
+            )
+        raise ValueError(
+            f"{bounds}: there is no room to act in. Leave the dimension out of the action space, and let a wrapper add it "
+            "(gymnasium.wrappers.TransformAction)."
         )
