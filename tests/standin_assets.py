@@ -73,10 +73,12 @@ def write_textured(folder: Path, mesh: trimesh.Trimesh) -> None:
 
 def make_egad(folder: Path) -> None:
     models = {}
-    for name, size in (("A0_0", 0.02), ("B1_2", 0.025)):
+    for name, size, off_center in (("A0_0", 0.02, 0.0), ("B1_2", 0.025, 0.03)):  # EGAD's origins lie anywhere
         ball = bumpy_ball(size)
         corners = ball.vertices
         parts = [trimesh.convex.convex_hull(corners[side * corners[:, 2] >= 0][::16]) for side in (1, -1)]
+        for mesh in (ball, *parts):
+            mesh.apply_translation((off_center, 0, 0))
         for kind, meshes in (("egad_train_set", [ball]), ("egad_train_set_coacd", parts)):
             (folder / kind).mkdir(parents=True, exist_ok=True)
             (folder / kind / f"{name}.obj").write_text(obj_text(meshes))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from sb3_cpm.envs import ManiSkillEnv, assets, make_maniskill_env
+from sb3_cpm.envs import GoalView, ManiSkillEnv, assets, make_maniskill_env
 from sb3_cpm.envs.tasks import REPORT_TASKS, register_tasks
 
 CONTROLLERS = ("pd_ee_delta_pose", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
@@ -202,6 +202,26 @@ def test_pick_single_egad_by_hand() -> None:
     task.obj.set_pose(Pose.create_from_pq(moved, task.obj.pose.q))
     assert reward_of(task)[:2] == (10.0, 1.0)
     env.close()
+
+
+def test_the_goal_view_of_egad_measures_from_the_centre_of_mass() -> None:
+    from mani_skill.utils.structs.pose import Pose
+
+    view = GoalView(make("PickSingleEGAD-v1", obs_mode="state"))
+    task: Any = view.unwrapped
+    apart = []
+    for seed in range(6):  # the object is another one after each reset
+        observation, _ = view.reset(seed=seed)
+        np.testing.assert_allclose(observation["achieved_goal"], task.obj_pose.p[0], atol=1e-6)
+        apart.append(float(torch.linalg.norm(task.obj.pose.p - task.obj_pose.p)))
+        for off in (0.024, 0.026):
+            goal = task.goal_site.pose.p + torch.tensor([0, 0, off])
+            task.obj.set_pose(Pose.create_from_pq(task.obj.pose.p + goal - task.obj_pose.p, task.obj.pose.q))
+            places = {key: place.numpy() for key, place in view.get_wrapper_attr("batch").goal.positions(task).items()}
+            placed = bool(task.evaluate()["is_obj_placed"])
+            assert placed == (off < 0.025) and view.compute_reward(**places)[0] == (0 if placed else -1)
+    assert max(apart) > 0.005  # one of them has its origin elsewhere
+    view.close()
 
 
 def test_goals_of_egad_lie_in_manipulation_range_and_off_the_object() -> None:

@@ -90,6 +90,53 @@ def state_position(view: GoalView) -> np.ndarray:
 
 
 @pytest.mark.maniskill
+def test_a_stack_is_what_the_task_calls_one() -> None:
+    view = GoalView(make_maniskill_env("StackCube-v1", obs_mode="state", max_episode_steps=50))
+    view.reset(seed=1)
+    task: Any = view.unwrapped
+    # metres beside and above the right place; cubes of 4 cm
+    off = [(0, 0), (0.033, 0), (0.034, 0), (0.05, 0), (0, 0.004), (0, 0.006), (0, -0.006), (0, 0.015), (0.03, 0.004)]
+    truth, achieved, desired = [], [], []
+    for beside, above in off:
+        task.cubeA.set_pose(th_pose((task.cubeB.pose.p[0] + th.tensor([beside, 0, 0.04 + above])).tolist()))
+        places = view.get_wrapper_attr("batch").goal.positions(task)
+        truth.append(bool(task.evaluate()["is_cubeA_on_cubeB"]))
+        achieved.append(places["achieved_goal"][0].numpy())
+        desired.append(places["desired_goal"][0].numpy())
+    assert truth == [True, True, False, False, True, False, False, False, True]
+    np.testing.assert_array_equal(view.compute_reward(np.array(achieved), np.array(desired)), np.where(truth, 0, -1))
+    # a step says the same
+    for beside, reached in ((0.025, True), (0.05, False)):
+        task.cubeA.set_pose(th_pose((task.cubeB.pose.p[0] + th.tensor([beside, 0, 0.04])).tolist()))
+        observation, reward, _, _, info = view.step(np.zeros(7))
+        places = observation["achieved_goal"], observation["desired_goal"]
+        assert info["is_cubeA_on_cubeB"] == reached == info["goal_reached"]
+        assert reward == view.compute_reward(*places) == (0 if reached else -1)
+        task.cubeA.set_pose(th_pose((task.cubeB.pose.p[0] + th.tensor([0.2, 0, 0])).tolist()))
+    view.close()
+
+
+@pytest.mark.maniskill
+def test_nothing_is_shown_as_seen_from_the_goal() -> None:
+    """The lower cube stays, as the thing that it is; where hand and upper cube are from there is only in ``desired_goal``."""
+    view = GoalView(make_maniskill_env("StackCube-v1", obs_mode="state"))
+    observation, _ = view.reset(seed=1)
+    layout = view.get_wrapper_attr("batch").state_layout
+    told = {"tcp_to_cubeB_pos", "cubeA_to_cubeB_pos"}
+    assert told < layout.keys() and observation["observation"].shape == (48 - 6,)
+    task: Any = view.unwrapped
+    for other in (task.agent.tcp, task.cubeA):
+        difference = (task.cubeB.pose.p - other.pose.p)[0].numpy()
+        assert not any(np.allclose(observation["observation"][i : i + 3], difference, atol=1e-5) for i in range(40))
+    np.testing.assert_allclose(observation["observation"][32:35], task.cubeB.pose.p[0])
+    with pytest.raises(ValueError, match="hides 'cubeC_pose', which is no part of this state. It has: agent/qpos"):
+        GoalView(view.env, Goal("cubeA", "cubeB", 0.02, hidden=("cubeC_pose",)))
+    with pytest.raises(ValueError, match=r"height=0.01\) needs axes=3, got axes=2"):
+        GoalView(view.env, Goal("cubeA", "cubeB", 0.02, axes=2, height=0.01))
+    view.close()
+
+
+@pytest.mark.maniskill
 def test_checker_of_sb3(env: GoalView) -> None:
     with quietly():
         check_env(env)
@@ -141,6 +188,24 @@ def test_hindsight_trains(env: GoalView, buffer: Any) -> None:
 
 
 TINY: dict[str, Any] = {"batch_size": 2, "sequence_length": 5}
+
+
+def test_a_thing_may_be_a_pose() -> None:
+    task = SimpleNamespace(
+        thing=SimpleNamespace(pose=SimpleNamespace(p=th.zeros(1, 3))),
+        center=SimpleNamespace(p=th.tensor([[0.03, 0.0, 0.0]])),
+        aim=SimpleNamespace(p=th.ones(1, 3)),
+    )
+    places = Goal("center", "aim", 0.1).positions(task)
+    assert places["achieved_goal"].tolist() == [[pytest.approx(0.03), 0, 0]] and places["desired_goal"].tolist() == [[1, 1, 1]]
+    assert Goal("thing", "aim", 0.1).positions(task)["achieved_goal"].tolist() == [[0, 0, 0]]
+
+
+def test_a_goal_may_be_narrower_in_height() -> None:
+    goal = Goal("thing", "aim", 0.1, height=0.01)
+    achieved = np.array([[[0.06, 0.06, 0], [0.08, 0.08, 0]], [[0.06, 0.06, 0.02], [0.0, 0.0, -0.009]]], dtype=np.float32)
+    assert goal.reached(achieved, np.zeros(3)).tolist() == [[True, False], [False, True]]
+    assert goal._replace(height=None).reached(achieved, np.zeros(3)).tolist() == [[True, False], [True, True]]
 
 
 # ---------------------------------------------------------------------- several environments in one simulation

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,19 +38,28 @@ class Mortal(gym.Wrapper):
         self.marker = "none"
         self.limit = limit
         self.steps = 0
+        self.next_start: float | None = None
 
     def behave(self, how: str) -> None:
         self.marker = how
 
+    def start_next_from(self, place: float) -> None:
+        self.next_start = place
+
+    def look(self) -> Any:
+        return self.observation
+
     def reset(self, **kwargs: Any) -> Any:
         self.steps = 0
-        return self.env.reset(**kwargs)
+        self.started_from, self.next_start = self.next_start, None
+        self.observation, info = self.env.reset(**kwargs)
+        return self.observation, info
 
     def step(self, action: Any) -> Any:
         if self.marker == "raise":
             raise RuntimeError("a mistake in the environment")
         if self.marker == "hang":
-            time.sleep(60)
+            time.sleep(600)
         self.steps += 1
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated or self.steps >= self.limit, info
@@ -114,9 +124,77 @@ def test_a_dead_worker_costs_one_episode(start_method: str) -> None:
         with pytest.warns(UserWarning, match="Worker 0 died"):
             result = ask()
         assert len(result) == (1 if isinstance(result, dict) else 2)
-        for _ in range(50):  # a whole episode, else three deaths in a row would be too many
+        # a whole episode, else three deaths in a row would be too many; before it the step that says that one was lost
+        for _ in range(50 if ask == env.reset else 51):
             _, _, dones, infos = env.step(ACTIONS)
         assert "episode" in infos[0]
+    env.close()
+
+
+def test_a_death_between_two_steps_ends_the_episode() -> None:
+    """The agent must never see the last observation of one episode and the second one of another as one transition."""
+    env = robust([partial(make, 50)] * 2)
+    env.seed(3)
+    env.reset()
+    before, _, _, _ = env.step(ACTIONS)
+    for _ in range(2):  # also where the new one dies before the agent was told
+        kill(env, 0)
+        with pytest.warns(UserWarning, match="Worker 0 died with exit code -9"):
+            assert env.get_attr("steps") == [0, 1]
+    first = env.env_method("look", indices=[0])[0]
+    observations, rewards, dones, infos = env.step(ACTIONS)
+    assert dones.tolist() == [True, False] and rewards[0] == 0 and env.get_attr("steps") == [0, 2]
+    assert infos[0]["TimeLimit.truncated"] is True and "exit code -9" in infos[0]["worker_died"]
+    np.testing.assert_array_equal(infos[0]["terminal_observation"]["state"], before["state"][0])  # type: ignore
+    np.testing.assert_array_equal(observations["state"][0], first["state"])  # type: ignore[call-overload,index]
+    assert not env.step(ACTIONS)[2].any() and env.get_attr("steps") == [1, 3]
+    # a reset begins a new episode anyway
+    kill(env, 1)
+    with pytest.warns(UserWarning, match="Worker 1 died"):
+        env.get_attr("steps")
+    env.reset()
+    assert not env.step(ACTIONS)[2].any() and env.get_attr("steps") == [1, 1]
+    env.close()
+
+
+def test_a_start_that_was_asked_for_survives_its_worker() -> None:
+    env = robust([partial(make, 3)] * 2, episodes_per_worker=2)
+    env.seed(3)
+    env.reset()
+    starts = []
+    for number in range(5):  # workers are replaced after the second and the fourth episode
+        env.env_method("start_next_from", float(number), indices=[0])
+        for _ in range(3):
+            _, _, dones, _ = env.step(ACTIONS)
+        assert dones.all()
+        starts.append(env.get_attr("started_from"))
+    assert starts == [[float(number), None] for number in range(5)]
+
+    def lost(ask: Callable[[], Any]) -> list[Any]:
+        kill(env, 0)
+        with pytest.warns(UserWarning, match="Worker 0 died"):
+            ask()
+        return env.get_attr("started_from", 0)
+
+    # it is for one episode only, whoever dies when
+    assert lost(lambda: env.step(ACTIONS)) == [None]
+    env.env_method("start_next_from", 7.0, indices=[0])
+    assert lost(lambda: env.step(ACTIONS)) == [7.0]
+    for _ in range(3):
+        env.step(ACTIONS)
+    assert env.get_attr("started_from", 0) == [None]
+    assert lost(lambda: env.env_method("start_next_from", 8.0, indices=[0])) == [8.0]  # dies of the question
+    env.step(ACTIONS)
+    assert env.get_attr("started_from", 0) == [8.0]
+    for _ in range(3):
+        env.step(ACTIONS)
+    assert env.get_attr("started_from", 0) == [None]
+    lost(lambda: env.get_attr("limit"))
+    env.env_method("start_next_from", 9.0, indices=[0])  # the episode that was lost is still "the one that is running"
+    env.step(ACTIONS)
+    assert env.get_attr("started_from", 0) == [9.0]
+    env.env_method("start_next_from", 10.0, indices=[0])
+    assert lost(env.reset) == [10.0]
     env.close()
 
 
@@ -138,6 +216,23 @@ def test_a_mistake_is_not_repeated_for_ever() -> None:
     with pytest.raises(RuntimeError, match="3 deaths without a finished episode"):
         env.step(ACTIONS[:1])
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore:Worker 1 died")
+def test_closing_after_the_last_death(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One has answered, one is dead, one has an answer that nobody took, one will never answer: none of them is waited for."""
+    monkeypatch.setattr("sb3_cpm.envs.robust.CLOSING", 2.0)
+    env = robust([make, partial(make, how="raise"), make, make])
+    env.reset()
+    actions = np.full((4, 2), 0.5, dtype=np.float32)
+    env.step(actions), env.step(actions)
+    env.env_method("behave", "hang", indices=[3])
+    with pytest.raises(RuntimeError, match="Worker 1 died"):
+        env.step(actions)
+    processes = [worker.process for worker in env.workers]
+    start = time.monotonic()
+    env.close()
+    assert time.monotonic() - start < 20 and not any(process.is_alive() for process in processes)
 
 
 def broken() -> gym.Env:

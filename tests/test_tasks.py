@@ -3,7 +3,9 @@ The tasks of the report: with their objects in processes of their own (tasks_on_
 states on a machine that cannot draw.
 """
 
+import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -102,6 +104,17 @@ def cut_off(file: Path) -> None:
     file.write_text("{")
 
 
+def half(file: Path) -> None:
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+
+
+def most(file: Path) -> None:
+    """Cut off in one of the last lines, after its second number."""
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines[:-3], " ".join(lines[-3].split()[:3])]))
+
+
 def empty(file: Path) -> None:
     file.write_text("")
 
@@ -114,10 +127,15 @@ def empty(file: Path) -> None:
         ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", Path.unlink, "002_can/collision.ply is missing"),
         ("PickSingleYCB-v1", f"{YCB}/models/002_can/textured.obj", empty, "002_can/textured.obj is empty"),
         ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", cut_off, "002_can/collision.ply is damaged"),
+        ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", half, "can/collision.ply is damaged (it ends early)"),
+        ("PickSingleYCB-v1", f"{YCB}/models/002_can/collision.ply", most, "can/collision.ply is damaged (it ends early)"),
+        ("PickSingleYCB-v1", f"{YCB}/models/002_can/textured.obj", most, "can/textured.obj is damaged (it ends early)"),
+        ("PickSingleEGAD-v1", f"{EGAD}/egad_train_set_coacd/A0_0.obj", half, "A0_0.obj is damaged (it ends early)"),
         ("PickSingleEGAD-v1", f"{EGAD}/egad_train_set/A0_0.obj", Path.unlink, "egad_train_set/A0_0.obj is missing"),
         ("TurnFaucet-v1", f"{PARTNET}/5004/mobility_cvx.urdf", Path.unlink, "5004 is not there"),
         ("TurnFaucet-v1", f"{PARTNET}/5004/mobility_cvx.urdf", cut_off, "is damaged"),
         ("OpenCabinetDoor-v1", f"{PARTNET}/../shapes/ball.obj", Path.unlink, "shapes/ball.obj is missing"),
+        ("OpenCabinetDoor-v1", f"{PARTNET}/../shapes/ball.obj", most, "shapes/ball.obj is damaged (it ends early)"),
     ],
 )
 def test_what_is_missing_or_damaged_is_named(
@@ -138,27 +156,58 @@ def test_what_is_missing_or_damaged_is_named(
     assets.require_assets.cache_clear()
 
 
-def test_a_failed_download_leaves_nothing(asset_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mani_skill.utils import download_asset
+@pytest.mark.parametrize("text", ["v 0 0 0\nf 1 2 3", "v 0 0 0\nf 1//1 2//2 3//3 4//4\r\n# the end\r\n\r\n", "g a\n"])
+def test_unusual_ends_of_whole_files(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "mesh.obj"
+    file.write_bytes(text.encode())
+    assert assets._absent([file]) == []
 
-    folder = asset_dir / EGAD
-    (folder / "info_pick_train_v0.json").unlink()
 
-    def fail(source: Any, **_: Any) -> None:
-        assert source.url.endswith(".zip")
-        raise OSError("no network")
+def test_a_failed_download_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mani_skill.utils.assets import DATA_SOURCES
 
-    monkeypatch.setattr(download_asset, "download", fail)
-    with pytest.raises(RuntimeError, match=r"egad could not be downloaded: no network.*by hand"):
-        list(assets.download(["PickSingleEGAD-v1"]))
-    assert not folder.exists()
+    assets.assets_of("PickSingleEGAD-v1")  # makes the task known
+    standin_assets.make_all(tmp_path / "assets")
+    data, archive = tmp_path / "assets/data", tmp_path / "egad"
+    folder = data / EGAD
+    # ManiSkill's own download, from a file
+    source = dataclasses.replace(DATA_SOURCES["egad"], url=f"file://{archive}.zip", output_dir=data, checksum=None)
+    monkeypatch.setitem(DATA_SOURCES, "egad", source)
 
-    def succeed(source: Any, **_: Any) -> None:
-        standin_assets.make_egad(folder)
+    def names() -> list[str]:
+        return sorted(str(file.relative_to(data)) for file in data.rglob("*") if EGAD in str(file))
 
-    monkeypatch.setattr(download_asset, "download", succeed)
-    assert len(list(assets.download(["PickSingleEGAD-v1"]))) == 1
     assert list(assets.download(["PickSingleEGAD-v1"])) == []  # what is there is not fetched again
+    whole = names()
+    (folder / "egad_train_set/B1_2.obj").unlink()
+    before = names()
+
+    def fails(message: str, error: type[BaseException] = RuntimeError) -> None:
+        with pytest.raises(error, match=message):
+            list(assets.download(["PickSingleEGAD-v1"]))
+        assert names() == before
+
+    fails(r"egad could not be downloaded: .*by hand")  # no such archive
+    shutil.make_archive(str(archive), "zip", data, f"{EGAD}/egad_train_set")
+    fails("egad could not be downloaded: what came is not complete: info_pick_train_v0.json")
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt("Ctrl-C")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("urllib.request.urlretrieve", interrupted)
+        fails("Ctrl-C", KeyboardInterrupt)
+    # an attempt that was killed: half of the new, and the old one still out of the way
+    folder.rename(folder.with_name(f"{EGAD}.before"))
+    (folder / "half").mkdir(parents=True)
+    fails("could not be downloaded")
+    # nothing was there
+    shutil.rmtree(folder)
+    before = names()
+    fails("could not be downloaded")
+    standin_assets.make_egad(tmp_path / EGAD)
+    shutil.make_archive(str(archive), "zip", tmp_path, EGAD)
+    assert len(list(assets.download(["PickSingleEGAD-v1"]))) == 1 and names() == whole
 
 
 BROKEN = """
@@ -179,6 +228,36 @@ def test_a_file_with_the_wrong_contents_is_an_error_with_the_cure(tmp_path: Path
             file.write_text("hello")
     child = run(["-c", BROKEN], MS_ASSET_DIR=str(tmp_path))
     assert child.stdout.count("refused") == 3, child.stdout + child.stderr
+
+
+LATER = """
+import sys
+from sb3_cpm.envs import make_maniskill_env
+env_id, file, size = sys.argv[1:]
+env = make_maniskill_env(env_id, obs_mode="state")
+whole = open(file, "rb").read()
+open(file, "wb").write(whole[: int(size)])
+try:
+    for seed in range(30):
+        env.reset(seed=seed)
+except RuntimeError as error:
+    assert f"assets --download {env_id}" in str(error), error
+    print("explained")
+"""
+
+
+@pytest.mark.parametrize(
+    ("env_id", "file"),
+    [
+        ("PickSingleYCB-v1", f"{YCB}/models/003_ball/collision.ply"),
+        ("PickSingleEGAD-v1", f"{EGAD}/egad_train_set_coacd/A0_0.obj"),
+    ],
+)
+def test_a_file_that_turns_out_to_be_damaged_at_a_reset(tmp_path: Path, env_id: str, file: str) -> None:
+    """Tasks that choose an object per episode read its file then."""
+    standin_assets.make_all(tmp_path)
+    child = run(["-c", LATER, env_id, str(tmp_path / "data" / file), "40"], MS_ASSET_DIR=str(tmp_path))
+    assert "explained" in child.stdout, child.stdout + child.stderr
 
 
 # ---------------------------------------------------------------------- states without a renderer

@@ -6,8 +6,10 @@ at which a batch job waits for ever. Here a missing or damaged file is an error 
 ``python -m sb3_cpm assets --download TASK`` fetches what is wanting.
 """
 
+import contextlib
 import functools
 import json
+import re
 import shutil
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +23,9 @@ GROUPS = {"OpenCabinetDoor-v1": ("partnet_mobility_cabinet",)}
 
 URDF_NAMES = ("mobility_cvx.urdf", "mobility_fixed.urdf")
 """Of which ManiSkill takes the first that it finds."""
+
+TAIL = 4096
+"""Bytes at the end of a mesh in which its last line is looked for."""
 
 
 class Asset(NamedTuple):
@@ -94,7 +99,7 @@ def download(env_ids: Sequence[str] = ()) -> Iterator[str]:
     :param env_ids: tasks, by default those of the report
     :return: what is being done, for people
     :raises ValueError: for a task that does not exist
-    :raises RuntimeError: if a download fails; nothing half-done stays
+    :raises RuntimeError: if a download fails; nothing half-done stays, and what was there before is there again
     """
     from mani_skill.utils import download_asset
     from mani_skill.utils.assets import DATA_SOURCES
@@ -106,15 +111,43 @@ def download(env_ids: Sequence[str] = ()) -> Iterator[str]:
             source = DATA_SOURCES[asset.source_id]
             yield f"{env_id}: {asset.source_id} from {source.url or source.hf_repo_id} ..."
             try:
-                download_asset.download(source, verbose=False, non_interactive=True)
+                with _replacing(asset.folder):
+                    download_asset.download(source, verbose=False, non_interactive=True)
+                    if problems := _examine(asset.source_id):
+                        raise ValueError(f"what came is not complete: {problems[0]}")
             except Exception as error:  # network, disk, checksum, a damaged archive: all the same to the user
-                shutil.rmtree(asset.folder, ignore_errors=True)  # ManiSkill would take the empty folder for a success
                 raise RuntimeError(
                     f"{asset.source_id} could not be downloaded: {error}. On a machine without network, unpack "
                     f"{source.url or source.hf_repo_id} into {asset.folder} by hand."
                 ) from error
-            if problems := _examine(asset.source_id):
-                raise RuntimeError(f"{asset.source_id} was downloaded, yet it is not complete: {problems[0]}.")
+
+
+@contextlib.contextmanager
+def _replacing(folder: Path) -> Iterator[None]:
+    """
+    The folder is out of the way meanwhile (ManiSkill would delete it first), gone afterwards, and back if anything fails: one
+    file of thousands may be wanting. Of the failed attempt nothing stays, ManiSkill would take an empty folder for a success.
+    """
+    aside = folder.with_name(f"{folder.name}.before")
+    if aside.exists():  # an attempt was killed, and `folder` is what it had of the new one
+        _remove(folder)
+    elif folder.exists():
+        folder.rename(aside)
+    try:
+        yield
+    except BaseException:  # Ctrl-C, too
+        _remove(folder)
+        if aside.exists():
+            aside.rename(folder)
+        raise
+    _remove(aside)
+
+
+def _remove(path: Path) -> None:
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    else:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 # ---------------------------------------------------------------------- which
@@ -215,9 +248,34 @@ def _absent(files: list[Path]) -> list[str]:
             absent.append(f"{file.parent.name}/{file.name} is empty")
         elif file.suffix == ".ply" and not _starts_with(file, b"ply"):
             absent.append(f"{file.parent.name}/{file.name} is damaged (no PLY)")  # SAPIEN would go on without the shape
+        elif (file.suffix == ".ply" and not _is_whole_ply(file)) or (file.suffix == ".obj" and not _is_whole_obj(file)):
+            absent.append(f"{file.parent.name}/{file.name} is damaged (it ends early)")
     return absent
 
 
 def _starts_with(file: Path, start: bytes) -> bool:
     with open(file, "rb") as opened:
         return opened.read(len(start)) == start
+
+
+def _is_whole_ply(file: Path) -> bool:
+    """Whether it has as many lines as its header promises. A binary one is believed."""
+    header, end, body = file.read_bytes().partition(b"end_header")
+    if b"format ascii" not in header:
+        return bool(end)
+    promised = sum(int(number) for number in re.findall(rb"^element \S+ (\d+)", header, re.MULTILINE))
+    return bool(end) and len(body.splitlines()) > promised  # the first is the rest of "end_header"
+
+
+def _is_whole_obj(file: Path) -> bool:
+    """
+    Whether it ends like one: the last statement is no vertex, which would have no face, and no face with half a corner. Only
+    the end is read. A missing line break says nothing, many programs write none; a cut within the last number is not seen.
+    """
+    with open(file, "rb") as opened:
+        opened.seek(max(0, file.stat().st_size - TAIL))
+        statements = [line.split(b"#")[0].split() for line in opened.read().splitlines()]
+    keyword, *corners = next((words for words in reversed(statements) if words), [b""])
+    if keyword == b"f":
+        return len(corners) >= 3 and len({re.sub(rb"\d+", b"0", corner) for corner in corners}) == 1
+    return keyword not in (b"v", b"vt", b"vn")

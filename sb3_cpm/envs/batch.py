@@ -5,6 +5,7 @@ The layer between ManiSkill's batched tensors and everybody else: N environments
 through every line of this module, so what holds for one holds for the other.
 """
 
+import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from gymnasium import spaces
 from sb3_cpm.envs import clouds
 from sb3_cpm.envs import observations as obs_tools
 from sb3_cpm.envs.companions import follow
+from sb3_cpm.envs.maniskill_checks import explained
 from sb3_cpm.envs.start_states import StartState, restore, state_of
 from sb3_cpm.envs.thrift import save_work
 from sb3_cpm.envs.visuals import Visuals
@@ -106,6 +108,7 @@ class ManiSkillBatch:
         :param states: where to start instead, see :meth:`get_state`
         :param options: passed to ManiSkill
         :return: observations with first axis n, and n infos
+        :raises RuntimeError: if the task builds a new scene and a file that this takes turns out to be damaged, with the cure
         """
         states = [None] * len(rows) if states is None else states
         self.episode_seeds[rows] = [s["seed"] if s is not None else seed for s, seed in zip(states, seeds, strict=True)]
@@ -116,7 +119,8 @@ class ManiSkillBatch:
             # ManiSkill seeds torch with the first entry. Were that the seed of environment 0, which is in the middle of its
             # episode, then the others would start at the same place again and again until that episode ends.
             given[0] = given[rows[0]]
-        with self._visuals:
+        builds = getattr(self.env, "reconfiguration_freq", 0) or (options or {}).get("reconfigure")
+        with explained(self.env_id) if builds else contextlib.nullcontext(), self._visuals:
             raw, info = self.env.reset(
                 seed=given.tolist(), options={**(options or {}), **({} if everyone else {"env_idx": index})}
             )

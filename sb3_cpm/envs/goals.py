@@ -25,11 +25,15 @@ class Goal(NamedTuple):
     """
     That something be somewhere.
 
-    :param thing: attribute of the ManiSkill task: the object that is to be moved
-    :param place: attribute of the ManiSkill task: where it is to be
-    :param threshold: metres between them that count as reached
+    :param thing: attribute of the ManiSkill task: the object that is to be moved, or a pose, where the task does not measure
+        from the object's origin
+    :param place: attribute of the ManiSkill task: where it is to be, an object or a pose
+    :param threshold: metres between them that count as reached; with ``height`` in the horizontal plane
     :param offset: metres from ``place`` to the goal
     :param axes: 3, or 2 where height does not matter
+    :param height: metres above or below the goal that count as reached, None where ``threshold`` says all
+    :param hidden: parts of the state (names of :attr:`ManiSkillBatch.state_layout`) that would tell the true goal behind the
+        back of ``desired_goal``, beside those that are named after a goal or a target
     """
 
     thing: str
@@ -37,26 +41,58 @@ class Goal(NamedTuple):
     threshold: float
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     axes: int = 3
+    height: float | None = None
+    hidden: tuple[str, ...] = ()
 
     def positions(self, task: Any) -> dict[str, th.Tensor]:
         """
         :param task: the unwrapped ManiSkill environment
         :return: ``achieved_goal`` and ``desired_goal``, metres, shape ``(N, axes)``
         """
-        place = getattr(task, self.place).pose.p
+        achieved, place = (_position(getattr(task, name)) for name in (self.thing, self.place))
         desired = place + th.tensor(self.offset, dtype=place.dtype, device=place.device)
-        return {"achieved_goal": getattr(task, self.thing).pose.p[:, : self.axes], "desired_goal": desired[:, : self.axes]}
+        return {"achieved_goal": achieved[:, : self.axes], "desired_goal": desired[:, : self.axes]}
+
+    def reached(self, achieved: np.ndarray, desired: np.ndarray) -> Any:
+        """
+        :param achieved: metres, shape ``(..., axes)``
+        :param desired: metres, shape ``(..., axes)``
+        :return: whether that is near enough, shape ``(...)``
+        """
+        apart = np.asarray(achieved) - np.asarray(desired)
+        if self.height is None:
+            return np.linalg.norm(apart, axis=-1) <= self.threshold
+        return (np.linalg.norm(apart[..., :2], axis=-1) <= self.threshold) & (np.abs(apart[..., 2]) <= self.height)
+
+
+def _position(thing: Any) -> th.Tensor:
+    """:param thing: an object, or a pose"""
+    position: th.Tensor = getattr(thing, "pose", thing).p
+    return position
 
 
 GOALS = {
     "PickCube-v1": Goal("cube", "goal_site", 0.025),
     "PickSingleYCB-v1": Goal("obj", "goal_site", 0.025),
-    "PickSingleEGAD-v1": Goal("obj", "goal_site", 0.025),
-    "StackCube-v1": Goal("cubeA", "cubeB", 0.02, offset=(0.0, 0.0, 0.04)),
+    "PickSingleEGAD-v1": Goal("obj_pose", "goal_site", 0.025),
+    "StackCube-v1": Goal(
+        "cubeA",
+        "cubeB",
+        float(np.hypot(0.02, 0.02)) + 0.005,
+        offset=(0.0, 0.0, 0.04),
+        height=0.005,
+        hidden=("tcp_to_cubeB_pos", "cubeA_to_cubeB_pos"),
+    ),
     "PushCube-v1": Goal("obj", "goal_region", 0.1, axes=2),
     "PullCube-v1": Goal("obj", "goal_region", 0.1, axes=2),
 }
-"""What the tasks want, with their own thresholds."""
+"""
+What the tasks want, with their own thresholds.
+
+In StackCube the goal is on a thing. Of that cube only what is seen from it is hidden (where the hand and the other cube are
+from there); its own pose stays, as a camera would show it: it stands in the robot's way and carries the other cube, so that
+without it nobody could tell what an action does.
+"""
 
 REWARDS = ("sparse", "dense")
 
@@ -76,12 +112,23 @@ class _View:
                 "The point cloud shows the goal, which hindsight cannot change: make the environment with goal_points=0."
             )
         self.goal = goal or GOALS[batch.env_id]
+        layout = batch.state_layout
+        unknown = [name for name in self.goal.hidden if name not in layout]
+        if unknown and batch.obs_mode == "state":  # in the other mode no part tells where objects are
+            raise ValueError(
+                f"The goal hides {unknown[0]!r}, which is no part of this state. It has: {', '.join(layout)}; "
+                "correct Goal(hidden=...)."
+            )
+        if self.goal.height is not None and self.goal.axes != 3:
+            raise ValueError(f"Goal(height={self.goal.height:g}) needs axes=3, got axes={self.goal.axes}: leave one out.")
         self.dense = reward == "dense"
         batch.goal = self.goal
         # A goal environment goes on until its time is over: hindsight changes goals, it cannot change where episodes ended.
         batch.ignore_terminations = True
         # what would tell the true goal behind the back of `desired_goal`
-        told = [part for name, part in batch.state_layout.items() if "goal" in name or name.startswith("target")]
+        told = [
+            part for name, part in layout.items() if "goal" in name or name.startswith("target") or name in self.goal.hidden
+        ]
         hidden = {i for part in told for i in range(part.start, part.stop)}
         size = batch.observation_space["state"].shape[0]  # type: ignore[index]
         self._keep = np.array([i for i in range(size) if i not in hidden], dtype=np.intp)
@@ -105,8 +152,9 @@ class _View:
         :param info: not needed
         :return: 0 where the goal is reached, else -1 (``"sparse"``); minus the metres between (``"dense"``); shape ``(...)``
         """
-        distance = self.distance(achieved_goal, desired_goal)
-        return -distance if self.dense else -(distance > self.goal.threshold).astype(np.float32)
+        if self.dense:
+            return -self.distance(achieved_goal, desired_goal)
+        return np.asarray(self.goal.reached(achieved_goal, desired_goal), dtype=np.float32) - 1
 
 
 class GoalView(gym.Wrapper[Any, Any, Any, Any]):
@@ -139,7 +187,7 @@ class GoalView(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: np.ndarray) -> tuple[Tree, float, bool, bool, dict[str, Any]]:
         observation, _, terminated, truncated, info = self.env.step(action)
         places = observation["achieved_goal"], observation["desired_goal"]
-        info["goal_reached"] = bool(self._view.distance(*places) <= self._view.goal.threshold)
+        info["goal_reached"] = bool(self._view.goal.reached(*places))
         return self._view.observation(observation), float(self.compute_reward(*places)), terminated, truncated, info
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any = None) -> Any:
@@ -183,8 +231,8 @@ class GoalVecEnv(VecEnvWrapper):
                 value[i] = last[key]
         rewards = np.asarray(self._view.compute_reward(*places.values()), dtype=np.float32)
         self._returns += rewards
-        for i, distance in enumerate(self._view.distance(*places.values()).tolist()):
-            infos[i]["goal_reached"] = distance <= self._view.goal.threshold
+        for i, reached in enumerate(self._view.goal.reached(*places.values()).tolist()):
+            infos[i]["goal_reached"] = reached
             if dones[i]:
                 infos[i]["episode"]["r"] = round(float(self._returns[i]), 6)
                 self._returns[i] = 0

@@ -133,6 +133,11 @@ def explained(env_id: str) -> Iterator[None]:
         if "download" not in str(error).lower() and "failed to load" not in str(error).lower():
             raise
         raise missing_assets(env_id, str(error)) from error
+    except AttributeError as error:
+        # ManiSkill's tasks measure the collision shapes, without which SAPIEN goes on where it cannot read them
+        if "bounding_box" not in str(error):
+            raise
+        raise missing_assets(env_id, "an object has no collision shapes, SAPIEN could not read its file") from error
     finally:
         logger.setLevel(level)
 

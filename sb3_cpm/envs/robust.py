@@ -10,6 +10,7 @@ that it replaces, so that every method of SB3's works as it is, and brings up a 
 
 import contextlib
 import multiprocessing as mp
+import time
 import warnings
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
@@ -24,6 +25,9 @@ from stable_baselines3.common.vec_env.subproc_vec_env import _worker
 MAX_DEATHS = 3
 """A worker that dies so many times without finishing an episode in between is not unlucky but wrong."""
 
+CLOSING = 10.0
+"""Seconds that ``close`` gives all workers together to finish what they are doing, before it kills them."""
+
 
 class RobustSubprocVecEnv(SubprocVecEnv):
     """
@@ -32,9 +36,11 @@ class RobustSubprocVecEnv(SubprocVecEnv):
     What the agent sees of it: its episode is truncated. ``done`` is true, the reward of that step is 0, ``infos[i]`` has
     ``TimeLimit.truncated`` (so that values are bootstrapped), ``terminal_observation``: the last observation that is known,
     the one before the step, and ``worker_died``: what happened. There is no ``episode`` entry, since the ``Monitor`` died too.
-    A warning tells the user; :attr:`restarts` counts.
+    A warning tells the user; :attr:`restarts` counts. If it dies between two steps (when ``env_method`` asks it, say), the new
+    environment answers, and the next step is not carried out but truncates the episode in the same way.
 
-    The new environment gets a new seed (ruled by the seed of the old one), and the attributes that were set with ``set_attr``.
+    The new environment gets a new seed (ruled by the seed of the old one), the attributes that were set with ``set_attr``, and
+    the start that was asked for with ``start_next_from`` if no episode began there yet.
     An environment that raises an exception dies of it as well; after three deaths without a finished episode the training
     stops with a RuntimeError.
 
@@ -77,9 +83,9 @@ class RobustSubprocVecEnv(SubprocVecEnv):
     def close(self) -> None:
         if self.closed:
             return
-        for worker in self.workers if self.waiting else []:
-            with contextlib.suppress(EOFError, OSError):
-                worker.drain()  # nobody replaces a dead one any more
+        deadline = time.monotonic() + CLOSING
+        for worker in self.workers:
+            worker.drain(max(0.0, deadline - time.monotonic()))
         self.waiting = False
         self.processes = []  # the workers wait for theirs
         super().close()
@@ -121,8 +127,11 @@ class _Worker:
         self._generations = 0
         self._seed: int | None = None
         self._asked: tuple[str, Any] = ("", None)
+        self._owes_answer = False
         self._attributes: dict[str, Any] = {}
-        self._last_observation: Any = None
+        self._next_start: Any = None  # the call of `start_next_from` whose episode has not begun
+        self._last_observation: Any = None  # that the agent saw
+        self._untold: tuple[Any, ...] | None = None  # the answer to the next step, where the worker died between two steps
 
     # ------------------------------------------------------------------ a connection
     def send(self, message: tuple[str, Any]) -> None:
@@ -132,18 +141,29 @@ class _Worker:
             self._attributes[data[0]] = data[1]
         if command == "reset" and data[0] is not None:
             self._seed = data[0]
+        if command == "reset":
+            self._untold = None
+        if command == "env_method" and data[0] == "start_next_from":
+            self._next_start = data
+        if command == "step" and self._untold is not None:
+            return
+        self._owes_answer = True
         # if it is dead, `recv` sees to that, when the other workers have their message, too
         with contextlib.suppress(OSError):
             self.remote.send(message)
 
     def recv(self) -> Any:
         command, data = self._asked
-        try:
-            answer = self._receive()
-        except (EOFError, OSError) as error:
-            answer = self._recover(command, data, error)
+        if command == "step" and self._untold is not None:
+            answer = self._tell()
+        else:
+            try:
+                answer = self._receive(self.timeout)
+            except (EOFError, OSError) as error:
+                answer = self._recover(command, data, error)
         if command == "reset":
             self._last_observation = answer[0]
+            self._next_start = None
         elif command == "step":
             self._last_observation = answer[0]
             if answer[2]:
@@ -157,20 +177,25 @@ class _Worker:
             self.process.join()
         self.remote.close()
 
-    def drain(self) -> None:
+    def drain(self, timeout: float) -> None:
         """
-        Forget the answer that is under way.
+        Forget the answer that is under way, if there is one: a worker that cannot get rid of it would not close.
 
-        :raises EOFError: if there will be none, or an OSError
+        :param timeout: seconds after which the process is killed
         """
-        self._receive()
+        if self._owes_answer:
+            try:
+                self._receive(timeout)
+            except (EOFError, OSError):  # nobody replaces a dead one any more
+                self.process.kill()
 
-    def _receive(self) -> Any:
+    def _receive(self, timeout: float | None) -> Any:
         # Also look at the process: of a worker that was forked, its brothers hold copies of the pipe's other end, so that the
         # pipe stays open when it dies.
-        ready = wait([self.remote, self.process.sentinel], self.timeout)
+        ready = wait([self.remote, self.process.sentinel], timeout)
         if not ready:
-            raise TimeoutError(f"gave no answer for {self.timeout:g} s")
+            raise TimeoutError(f"gave no answer for {timeout:g} s")
+        self._owes_answer = False
         if self.remote not in ready and not self.remote.poll():
             raise EOFError
         return self.remote.recv()
@@ -180,6 +205,7 @@ class _Worker:
         """:return: the answer to the command that the old process left unanswered"""
         self.process.kill()
         self.process.join()
+        self._owes_answer = False
         reason = str(error) if isinstance(error, TimeoutError) else f"died with exit code {self.process.exitcode}"
         self.deaths += 1
         self._deaths_in_a_row += 1
@@ -190,19 +216,28 @@ class _Worker:
             ) from error
         warnings.warn(f"Worker {self.index} {reason}: a new one takes its place, its episode is truncated.", stacklevel=2)
         if command == "reset":
-            self._start()
-            self._call("reset", data)
-            return self._answer
+            return self._replace(*data)
+        is_start = command == "env_method" and data is self._next_start
         observation, info = self._replace()
+        lost = {"TimeLimit.truncated": True, "terminal_observation": self._last_observation, "worker_died": reason}
+        answer = observation, 0.0, True, lost, info
         if command == "step":
-            lost = {
-                "TimeLimit.truncated": True,
-                "terminal_observation": self._last_observation,
-                "worker_died": reason,
-            }
-            return observation, 0.0, True, lost, info
-        self._call(command, data)
-        return self._answer
+            return answer
+        self._untold = answer
+        if is_start:  # the new episode has begun there; asked once more, the next one would, too
+            return None
+        return self._call(command, data)
+
+    def _tell(self) -> tuple[Any, ...]:
+        """:return: the answer to a step of an episode that was lost before"""
+        assert self._untold is not None
+        answer, self._untold = self._untold, None
+        if self._next_start is None:
+            return answer
+        # asked for after the death: meant for the episode that begins now, as the agent sees it
+        observation, info = self._call("reset", (None, {}))
+        self._next_start = None
+        return observation, *answer[1:4], info
 
     def _episode_ended(self, answer: tuple[Any, ...]) -> tuple[Any, ...]:
         if "worker_died" in answer[3]:
@@ -210,6 +245,7 @@ class _Worker:
         self._deaths_in_a_row = 0
         self._episodes += 1
         if self._episodes != self.episodes_per_worker:
+            self._next_start = None
             return answer
         with contextlib.suppress(OSError):
             self.remote.send(("close", None))
@@ -218,15 +254,24 @@ class _Worker:
         self._last_observation = observation
         return observation, *answer[1:4], info
 
-    def _replace(self) -> tuple[Any, dict[str, Any]]:
-        """A new process with a new episode. :return: what its reset returned"""
+    def _replace(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        A new process with a new episode.
+
+        :param seed: of the episode, None for one that follows from the old process's
+        :param options: of its reset
+        :return: what its reset returned
+        """
         self._start()
         self._generations += 1
-        own = np.random.SeedSequence([self._seed or 0, self.index, self._generations])
-        # without a seed for the old one, SB3 seeds NumPy's generator
-        seed = int(np.random.randint(2**31)) if self._seed is None else int(own.generate_state(1)[0] >> 1)
-        self._call("reset", (seed, {}))
-        observation, info = self._answer
+        if seed is None:
+            own = np.random.SeedSequence([self._seed or 0, self.index, self._generations])
+            # without a seed for the old one, SB3 seeds NumPy's generator
+            seed = int(np.random.randint(2**31)) if self._seed is None else int(own.generate_state(1)[0] >> 1)
+        if self._next_start is not None:
+            self._call("env_method", self._next_start)
+        observation, info = self._call("reset", (seed, options))
+        self._next_start = None
         return observation, info
 
     def _start(self) -> None:
@@ -240,10 +285,11 @@ class _Worker:
         for name, value in self._attributes.items():
             self._call("set_attr", (name, value))
 
-    def _call(self, command: str, data: Any) -> None:
+    def _call(self, command: str, data: Any) -> Any:
         try:
+            self._owes_answer = True
             self.remote.send((command, data))
-            self._answer = self._receive()
+            return self._receive(self.timeout)
         except (EOFError, OSError) as error:
             raise RuntimeError(
                 f"Worker {self.index}: the process that replaces another one died, too, when it was asked for {command!r}. "
