@@ -95,7 +95,7 @@ def make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--seeds", type=int, help="how many (default: as planned)")
     reproduce.add_argument("--agents", nargs="+", metavar="NAME", help="run only these, as the figure names them")
     reproduce.add_argument("--tasks", nargs="+", metavar="NAME", help="run only these, as the figure names them")
-    reproduce.add_argument("--steps", type=int, help="of each run, to try something (default: as planned)")
+    reproduce.add_argument("--steps", type=int, help="of each run, to try something; kept apart (default: as planned)")
     reproduce.add_argument("--jobs", type=int, default=1, help="processes at a time; 0: in this process (default: 1)")
     reproduce.add_argument("--results", default="results", help="folder of all results (default: results)")
     reproduce.add_argument("--draw-only", action="store_true", help="run nothing, draw what is there")

@@ -1,8 +1,8 @@
 """
 The conductor: drives the challenger during ``model.learn()`` (Algorithm 1 of the report).
 
-Everything goes through SB3's own seams: a callback, a replay buffer class, and a VecEnv wrapper that is around the
-model's environment for the time of ``learn()``.
+Everything goes through SB3's own seams: a callback, a replay buffer class, and a VecEnv wrapper around the model's
+environment, through which ``learn()`` takes its steps.
 """
 
 import signal
@@ -17,7 +17,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
@@ -51,7 +51,8 @@ class ChallengerCallback(BaseCallback):
     :param decay_kwargs: its start, floor and rate
     :param unit: whether P or C acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
     :param segment_length: number of steps in a segment
-    :param train_freq: number of environment steps (over all environments) between the challenger's updates
+    :param train_freq: number of environment steps (over all environments) between the challenger's updates; those that fall
+        due in a rollout are made at its end
     :param gradient_steps: number of its updates then
     :param load_path: a challenger saved by :meth:`save` to start from
     :param device: PyTorch device of the challenger; "auto": the model's
@@ -105,7 +106,8 @@ class ChallengerCallback(BaseCallback):
         self.stopwatch = Stopwatch()
         self._env: ExplorationVecEnv | None = None
         self._previous_sigint: Any = None
-        self._last_training = 0
+        self._learn_started = 0.0
+        self._next_training = 0
 
     # ------------------------------------------------------------------ public
 
@@ -176,11 +178,15 @@ class ChallengerCallback(BaseCallback):
         model = self.model
         assert self.challenger is not None and isinstance(model, OffPolicyAlgorithm)
         self._detach()
-        if self.buffer.player_keys is None:
-            self.buffer.player_keys = _player_keys(model)
+        env, buffer = without_exploration(model.env), self.buffer
+        if buffer.player_keys is None:
+            buffer.player_keys = _player_keys(model)
+        for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
+            if d is not None:
+                d.env = env
         last_obs = model._last_obs if model._vec_normalize_env is None else model._last_original_obs
         self._env = ExplorationVecEnv(
-            without_exploration(model.env),
+            env,
             self.challenger,
             lambda: self.epsilon,
             last_obs,  # type: ignore[arg-type]
@@ -190,9 +196,11 @@ class ChallengerCallback(BaseCallback):
             on_failure=self._detach,
         )
         model.env = self._env
-        self.buffer.has_challenger = True
-        self.buffer.stopwatch = self.stopwatch
-        self._last_training = model.num_timesteps
+        self._learn_started = model.start_time
+        buffer.has_challenger = self._is_running
+        buffer.stopwatch = self.stopwatch
+        # what came before learning_starts, and what an earlier learn() left, is no backlog
+        self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
         self._listen_for_ctrl_c()
 
     def _on_rollout_start(self) -> None:
@@ -200,6 +208,10 @@ class ChallengerCallback(BaseCallback):
         self.stopwatch.start("P acts")
         if self._env is not None:
             self._env.active = True
+            # SB3 has taken hold of the wrapper for this rollout. For all others the environment is as it was: EvalCallback
+            # walks its wrappers, and an exception of another callback, of which we hear nothing, leaves nothing behind
+            if self.model.env is self._env:
+                self.model.env = self._env.venv
 
     def _on_step(self) -> bool:
         return True
@@ -216,6 +228,8 @@ class ChallengerCallback(BaseCallback):
         self.logger.record("rollout/exploration_rate", self.epsilon)
         if self._env is not None:
             self._env.active = False
+            if self.model.env is self._env.venv:  # else somebody has set another one
+                self.model.env = self._env
         self.stopwatch.start("P trains")
 
     def _on_training_end(self) -> None:
@@ -261,12 +275,8 @@ class ChallengerCallback(BaseCallback):
 
     def _train_challenger(self) -> None:
         """Line 21: train world model, ensemble, and C's actor and critic on D."""
-        assert self.challenger is not None and isinstance(self.model, OffPolicyAlgorithm)
-        due = self.model.num_timesteps - self._last_training >= self.train_freq
-        if not (due and self.model.num_timesteps > self.model.learning_starts and self.buffer.episodes_ended):
-            return
-        self._last_training = self.model.num_timesteps
-        for _ in range(self.gradient_steps):
+        assert self.challenger is not None
+        for _ in range(self._due_trainings() * self.gradient_steps):
             with self.stopwatch.section("buffer"):
                 batch = self.buffer.sample_sequences(
                     self.challenger.batch_size, self.challenger.sequence_length, self.challenger.keys
@@ -276,6 +286,15 @@ class ChallengerCallback(BaseCallback):
             for name, value in metrics.items():
                 self.logger.record_mean(f"challenger/{name}", value)
             self.logger.record("challenger/n_updates", self.challenger.trained_updates, exclude="tensorboard")
+
+    def _due_trainings(self) -> int:
+        """:return: how many times C's training has fallen due; not while there is nothing to learn from, nor later for then"""
+        now = self.model.num_timesteps
+        if not self.buffer.episodes_ended:
+            self._next_training = max(self._next_training, now + 1)
+        due = max((now - self._next_training) // self.train_freq + 1, 0)
+        self._next_training += due * self.train_freq
+        return due
 
     def _log_proposal(self, proposal: Proposal) -> None:
         for name, value in proposal.coefficients.items():
@@ -295,6 +314,10 @@ class ChallengerCallback(BaseCallback):
                 self.logger.record_mean(f"challenge/reward_{term}", getattr(proposal.artificial, term).mean())
 
     # ------------------------------------------------------------------ coming and going
+
+    def _is_running(self) -> bool:
+        """Whether ``learn()`` is still the one that this callback was given to: an exception ends that without telling us."""
+        return self.model.start_time == self._learn_started
 
     def _detach(self) -> None:
         """Take the wrapper off the model's environment. Harmless when it is not there."""
@@ -320,8 +343,12 @@ class ChallengerCallback(BaseCallback):
             return
 
         def handler(signum: int, frame: FrameType | None) -> None:
-            self._detach()
-            previous(signum, frame)
+            try:
+                previous(signum, frame)
+            except BaseException:
+                self._detach()
+                raise
+            # one that returns, a flag set, lets the run go on, and C with it
 
         signal.signal(signal.SIGINT, handler)
         self._previous_sigint = previous
@@ -386,7 +413,7 @@ def _check_model(model: Any) -> None:
 def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
     """P can only sample once an episode has ended; say so now instead of in the middle of the run."""
     assert model.env is not None and isinstance(model.replay_buffer, CPMBuffer)
-    longest = _max_episode_steps(model.env)
+    longest = max_episode_steps(model.env)
     if longest is None or model.replay_buffer.episodes_ended:
         return
     needed = longest * model.n_envs
@@ -402,10 +429,14 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
         )
 
 
-def _max_episode_steps(env: VecEnv) -> int | None:
-    try:
-        specs = env.get_attr("spec")
-    except AttributeError:  # VecEnvs that are not made of gymnasium environments
-        return None
-    limits = [spec.max_episode_steps for spec in specs if spec is not None and spec.max_episode_steps is not None]
-    return max(limits) if limits else None
+def max_episode_steps(env: VecEnv) -> int | None:
+    """:return: the time limit of the environments, None where there is none or none can be known"""
+    if isinstance(env.unwrapped, SubprocVecEnv):
+        # Not every spec can be pickled, and a worker that cannot send what it was asked for dies: ask for TimeLimit's number
+        limits = env.get_attr("_max_episode_steps") if env.has_attr("_max_episode_steps") else []
+    else:
+        try:
+            limits = [spec.max_episode_steps for spec in env.get_attr("spec") if spec is not None]
+        except AttributeError:  # VecEnvs that are not made of gymnasium environments
+            return None
+    return max((limit for limit in limits if limit is not None), default=None)

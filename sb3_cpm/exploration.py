@@ -6,7 +6,7 @@ schedule convention: a function of the remaining progress, which falls from 1 to
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -153,7 +153,8 @@ class ExplorationVecEnv(VecEnvWrapper):
                 original = self._original(obs)
                 self._check_finite(original, rewards, dones, infos)
                 with self.stopwatch.section("C acts"):
-                    self._follow(original, dones, infos)
+                    self._follow(original, dones)
+                infos = self._report(infos)
             return obs, rewards, dones, infos
         except (EOFError, ConnectionError) as error:
             self.on_failure()
@@ -200,12 +201,17 @@ class ExplorationVecEnv(VecEnvWrapper):
         self._catch_up(envs)
         return self.challenger.act(self._latent.select(th.as_tensor(envs))).reshape(len(envs), *self._low.shape)
 
+    def _report(self, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """:return: the infos, with the action wherever C acted, in new dicts: environments may share theirs, or keep them"""
+        return [
+            {**info, EXECUTED_ACTION: executed.copy()} if explores else info
+            for info, executed, explores in zip(infos, self._executed, self._explores, strict=True)
+        ]
+
     # ------------------------------------------------------------------ C's latent state
 
-    def _follow(self, obs: dict[str, np.ndarray], dones: np.ndarray, infos: Any) -> None:
+    def _follow(self, obs: dict[str, np.ndarray], dones: np.ndarray) -> None:
         for env_idx, done in enumerate(dones):
-            if self._explores[env_idx]:
-                infos[env_idx][EXECUTED_ACTION] = self._executed[env_idx].copy()
             if done:
                 self._start_episode(env_idx, obs)
             else:
@@ -262,7 +268,8 @@ class ExplorationVecEnv(VecEnvWrapper):
                 )
             last = infos[env_idx].get("terminal_observation") if dones[env_idx] else None
             for key, array in obs.items():
-                for value in (array[env_idx],) if last is None else (array[env_idx], last[key]):
+                for raw in (array[env_idx],) if last is None else (array[env_idx], last[key]):
+                    value = np.asarray(raw)  # the last observation is as the environment gave it: a number, a list
                     if value.dtype.kind == "f" and not np.isfinite(value).all():
                         raise ValueError(
                             f"Environment {env_idx} gave NaN or infinite values in observation {key!r} at step "

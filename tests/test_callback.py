@@ -10,13 +10,15 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DQN, PPO, SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetPolicy
+from sb3_cpm.buffers import Demonstration
 from sb3_cpm.callbacks import without_exploration
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.exploration import ExplorationVecEnv
@@ -201,6 +203,28 @@ def test_vecnormalize():
     assert model.get_vec_normalize_env() is env and model.env is env
 
 
+def test_evaluation_and_checkpoints_beside_vecnormalize(tmp_path):
+    """SB3 walks the wrappers of training and evaluation in step to copy the statistics, and ours must not be among them."""
+    env, evaluation_env = VecNormalize(toy()), VecNormalize(toy(), training=False, norm_reward=False)
+    seen = set()
+
+    class WhatOthersSee(BaseCallback):
+        def _on_step(self):
+            seen.add(self.training_env)
+            return True
+
+    evaluation = EvalCallback(evaluation_env, n_eval_episodes=1, eval_freq=60, verbose=0)
+    checkpoint = CheckpointCallback(120, tmp_path, save_vecnormalize=True)
+    model, callback = make_model(env, buffer_kwargs=LENIENT), make_callback(decay="constant")
+    model.learn(240, callback=[evaluation, callback, checkpoint, WhatOthersSee()])
+    assert np.isfinite(evaluation.last_mean_reward) and evaluation.n_calls == 240
+    assert evaluation_env.obs_rms["state"].count == env.obs_rms["state"].count, "evaluated in the last step, too"
+    assert seen == {env} and callback.explored_share == pytest.approx(0.8, abs=0.1) and model.env is env
+    assert (tmp_path / "rl_model_vecnormalize_240_steps.pkl").exists()
+    model.learn(60, callback=[evaluation, callback], reset_num_timesteps=False)
+    assert callback.explored_share == pytest.approx(0.8, abs=0.2) and model.env is env
+
+
 def test_row_mix_with_evaluation_progress_bar_and_tensorboard(tmp_path):
     model = make_model(buffer_kwargs=dict(mix="row", **LENIENT))
     logger = configure(str(tmp_path), ["csv", "tensorboard"])
@@ -250,6 +274,55 @@ def test_ctrl_c_takes_the_wrapper_off_and_loses_nothing(tmp_path):
     assert isinstance(without_exploration(model.env), type(model.env))
 
 
+@pytest.mark.usefixtures("ctrl_c")
+def test_a_handler_of_the_users_that_lets_the_run_go_on():
+    """Many set a flag on Ctrl-C and stop at a moment of their choice."""
+    asked = []
+
+    class StopsAfterwards(BaseCallback):
+        def _on_step(self):
+            return not asked or self.num_timesteps < 230
+
+    def handler(signum, frame):
+        asked.append(signum)
+
+    signal.signal(signal.SIGINT, handler)
+    model, callback = make_model(), make_callback(decay="constant")
+    press = RaisesAt(170, lambda: os.kill(os.getpid(), signal.SIGINT))
+    model.learn(400, callback=[callback, press, StopsAfterwards()])
+    assert model.num_timesteps == 230 and signal.getsignal(signal.SIGINT) is handler
+    assert callback.explored_share == pytest.approx(0.8, abs=0.1), "C was not taken off when the signal came"
+
+
+def test_an_exception_of_another_callback_leaves_nothing_behind():
+    model, callback = make_model(), make_callback(decay="constant", decay_kwargs=dict(start=1.0))
+    env = model.env
+    with pytest.raises(ZeroDivisionError):
+        model.learn(400, callback=[callback, RaisesAt(130, lambda: 1 / 0)])
+    assert model.env is env
+    explored, size = callback._env.n_explored, model.replay_buffer.size()
+    evaluate_policy(model, model.get_env(), 1)
+    for reset in (True, False):  # SB3 tells no callback that its learn() is over
+        with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
+            model.learn(50, reset_num_timesteps=reset)
+    assert callback._env.n_explored == explored and model.replay_buffer.size() == size
+    model.learn(100, callback=callback, reset_num_timesteps=False)
+    assert callback.explored_share == 1.0 and model.env is env
+
+
+def test_an_exception_while_p_trains_leaves_nothing_that_acts():
+    model, callback = make_model(), make_callback(decay="constant", decay_kwargs=dict(start=1.0))
+    batch_size, model.batch_size = model.batch_size, "16"
+    with pytest.raises(TypeError):
+        model.learn(400, callback=callback)
+    model.batch_size = batch_size
+    explored = callback._env.n_explored
+    evaluate_policy(model, model.get_env(), 1)
+    with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
+        model.learn(50)
+    assert callback._env.n_explored == explored
+
+
 def test_an_environment_that_dies_takes_the_wrapper_off():
     class Dies(gym.Wrapper):
         n = 0
@@ -268,6 +341,110 @@ def test_an_environment_that_dies_takes_the_wrapper_off():
     model.set_env(toy())
     model.learn(100, callback=make_callback(), reset_num_timesteps=False)
     assert [episode.length for episode in model.replay_buffer.episodes][:4] == [50, 50, 19, 50]
+
+
+class Goals(gym.Env):
+    """Hindsight needs the environment itself: it computes the rewards."""
+
+    point = spaces.Box(-10, 10, (2,), np.float32)
+    observation_space = spaces.Dict(observation=point, achieved_goal=point, desired_goal=point)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n, self.at = 0, np.zeros(2, np.float32)
+        return self.observe(), {}
+
+    def observe(self):
+        return dict(observation=self.at.copy(), achieved_goal=self.at.copy(), desired_goal=np.ones(2, np.float32))
+
+    def compute_reward(self, achieved, desired, info):
+        return -np.linalg.norm(achieved - desired, axis=-1)
+
+    def step(self, action):
+        self.n += 1
+        self.at = (self.at + 0.1 * action).astype(np.float32)
+        return self.observe(), float(self.compute_reward(self.at, np.ones(2), {})), False, self.n >= 10, {}
+
+
+def test_hindsight_goes_on_in_new_environments_after_a_process_died():
+    """As the message of the error promises."""
+    env = SubprocVecEnv([Goals])
+    model = make_model(env, learning_starts=30, train_freq=7, buffer_kwargs=dict(n_sampled_goal=4))
+    callback = make_callback()
+    with pytest.raises(RuntimeError, match=r"goes on after model.set_env\(\)"):
+        model.learn(100, callback=[callback, RaisesAt(60, lambda: env.processes[0].kill())])
+    demonstrated = [Goals().reset()[0] for _ in range(6)]
+    observations = {key: np.stack([obs[key] for obs in demonstrated]) for key in demonstrated[0]}
+    model.replay_buffer.add_demonstrations([Demonstration(observations, np.zeros((5, 2), np.float32), np.ones(5))])
+    model.replay_buffer.mix = "row"
+    new = DummyVecEnv([Goals])
+    model.set_env(new)
+    model.learn(50, callback=callback, reset_num_timesteps=False)
+    assert model.num_timesteps >= 110 and model.replay_buffer.env is model.replay_buffer.demonstrations.env is new
+
+
+@pytest.mark.parametrize(
+    "n_envs, player, expected",
+    [(1, (1, "step"), 40), (1, (100, "step"), 40), (1, (2, "episode"), 40), (50, (1, "step"), 41)],
+)
+def test_how_often_c_trains_does_not_depend_on_the_length_of_rollouts(n_envs, player, expected):
+    """Every 10 steps over all environments, from the end of learning_starts on; there is no backlog of the steps before."""
+    learning_starts = 100 * n_envs
+    model = make_model(toy(n_envs=n_envs), learning_starts=learning_starts, train_freq=player, buffer_size=20_000)
+    callback = make_callback()
+    model.learn(learning_starts + 400, callback=callback)
+    updates = callback.challenger.trained_updates
+    assert updates == pytest.approx(expected, abs=1)
+    model.learn(95, callback=callback, reset_num_timesteps=False)
+    steps = model.num_timesteps - learning_starts - 400
+    assert callback.challenger.trained_updates - updates == pytest.approx(steps / 10, abs=1)
+
+
+def test_the_moments_at_which_c_trains_with_short_rollouts():
+    """One environment, one step at a time: the first update after learning_starts, then every train_freq steps."""
+    moments, model, callback = [], make_model(), make_callback(train_freq=13, gradient_steps=2)
+
+    class Counts(BaseCallback):
+        def _on_rollout_end(self):
+            while len(moments) < callback.challenger.trained_updates:
+                moments.append(self.num_timesteps)
+
+        def _on_step(self):
+            return True
+
+    model.learn(150, callback=[callback, Counts()])
+    assert moments == [101, 101, 114, 114, 127, 127, 140, 140]
+    moments[:] = [0] * 8
+    model.learn(30, callback=[callback, Counts()], reset_num_timesteps=False)
+    assert moments[8:] == [163, 163, 176, 176]
+
+
+class SharedInfos(VecEnvWrapper):
+    """Gives the same dict for all environments and steps in which there is nothing to say."""
+
+    def __init__(self, venv):
+        super().__init__(venv)
+        self.executed, self.nothing = [], {}
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_async(self, actions):
+        self.executed.append(np.array(actions))
+        self.venv.step_async(actions)
+
+    def step_wait(self):
+        obs, rewards, dones, infos = self.venv.step_wait()
+        return obs, rewards, dones, infos if dones.any() else [self.nothing] * self.num_envs
+
+
+def test_d_stores_what_was_executed_where_environments_share_their_infos():
+    env = SharedInfos(toy(n_envs=3))
+    model = make_model(env, learning_starts=150)
+    model.learn(300, callback=make_callback(decay="constant", decay_kwargs=dict(start=0.4)))
+    np.testing.assert_allclose(model.replay_buffer.actions[:100], np.array(env.executed), atol=1e-5)
+    assert env.nothing == {}
 
 
 def test_time_table_covers_the_run():
@@ -324,6 +501,26 @@ def never_step(env):
 def test_bad_input(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def unpicklable_spec():
+    return gym.wrappers.TransformReward(gym.make("CPMToy-v0", keys=("state",)), lambda reward: 2 * reward)
+
+
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_spec_that_no_process_can_send():
+    """Asking a worker for its spec would kill it; the number alone says what learning_starts must be."""
+    env = SubprocVecEnv([unpicklable_spec] * 2, start_method="fork")
+    with pytest.raises(ValueError, match="learning_starts=100 or more"):
+        make_model(env, learning_starts=99).learn(10, callback=make_callback())
+    make_model(env).learn(110, callback=make_callback())
+    env.close()
+
+
+def test_processes_without_a_time_limit():
+    env = SubprocVecEnv([Goals])  # its workers die of questions that they cannot answer
+    make_model(env, learning_starts=20).learn(30, callback=make_callback())
+    env.close()
 
 
 def test_discrete_actions():

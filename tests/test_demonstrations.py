@@ -1,14 +1,19 @@
 """Demonstrations: never overwritten, sampled at their own ratio, read from ManiSkill's trajectory files."""
 
 import json
+import os
+import subprocess
+import sys
 import types
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 
 from sb3_cpm.buffers import CPMBuffer, Demonstration
+from sb3_cpm.type_aliases import Evaluation
 
 h5py = pytest.importorskip("h5py", reason="h5py comes with mani_skill")
 
@@ -83,9 +88,41 @@ def test_bad_demonstrations_add_nothing(changes, message):
         buffer.add_demonstrations([])
 
 
-def test_shares_that_exceed_one():
+@pytest.mark.parametrize("mix", ["batch", "row"])
+def test_shares_that_exceed_one(mix):
     with pytest.raises(ValueError, match="not exceed 1 together"):
         make(challenge_ratio=0.7, demonstration_ratio=0.5)
+    buffer = make(challenge_ratio=0.95, mix=mix)  # fine, as long as there are no demonstrations
+    with pytest.raises(ValueError, match=r"challenge_ratio=0.95 and demonstration_ratio=0.1 .* not exceed 1 together"):
+        buffer.add_demonstrations([demonstration(1, 4)])
+    assert buffer.demonstrations is None
+    make(challenge_ratio=0.9, mix=mix).add_demonstrations([demonstration(1, 4)])
+
+
+@pytest.mark.parametrize("challenges, demonstrations, batch_size", [(0.5, 0.5, 255), (0.75, 0.25, 10), (0.35, 0.65, 10)])
+def test_rounded_shares_never_exceed_the_batch(challenges, demonstrations, batch_size):
+    """Half a row more for each would be one too many."""
+    buffer = make(mix="row", challenge_ratio=challenges, demonstration_ratio=demonstrations, warmup_steps=2)
+    buffer.has_challenger = True
+    buffer.add_demonstrations([demonstration(1, 4)])
+    play(buffer, 10)
+    episode = buffer.episodes[0]
+    uncertainty = np.linspace(0.1, 1, 10)
+    evaluation = Evaluation(uncertainty, uncertainty, np.ones((11, 2), np.float32))
+    assert buffer.propose(episode, evaluation).accepted
+    n_imaginary, n_demonstrated = buffer._shares(batch_size)
+    assert n_imaginary == round(challenges * batch_size) and n_imaginary + n_demonstrated <= batch_size
+    assert len(buffer.sample(batch_size).rewards) == batch_size
+
+
+def test_demonstrations_move_to_the_device_of_the_buffer():
+    """SB3 gives a loaded buffer the device of its model; "meta" stands for another one than the CPU."""
+    buffer = make(mix="row", demonstration_ratio=0.5)
+    buffer.add_demonstrations([demonstration(1, 4)])
+    play(buffer, 10)
+    buffer.device = th.device("meta")
+    samples = buffer.sample(8)
+    assert samples.rewards.device == samples.observations["state"].device == th.device("meta")
 
 
 # ---------------------------------------------------------------------- files
@@ -182,6 +219,14 @@ def test_files_that_cannot_be_read(broken, tmp_path):
     with pytest.raises(ValueError, match=messages[broken]):
         buffer.add_demonstrations(path, env=env)
     assert buffer.demonstrations is None
+
+
+@pytest.mark.maniskill
+def test_states_are_recorded_without_a_renderer(tmp_path):
+    environment = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent.json")
+    command = [sys.executable, "-m", "sb3_cpm.envs.scripted", str(tmp_path), "--episodes", "1"]
+    child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert child.returncode == 0 and (tmp_path / "scripted.h5").exists(), child.stderr
 
 
 @pytest.mark.maniskill

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
@@ -19,8 +20,9 @@ from sb3_cpm.__main__ import main
 from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_data, find_experiment, run_experiment, summary_table
 from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
-from sb3_cpm.experiments.collect import collect
+from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.evaluation import evaluate
+from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES
 from sb3_cpm.experiments.grid import attempt, perform_all
 from sb3_cpm.experiments.player_losses import player_losses
 from sb3_cpm.experiments.run_folder import LockedError, description, locked
@@ -166,6 +168,20 @@ def test_on_policy_agent_resumes_too(tmp_path, monkeypatch):
     check_resumed_equals_unbroken(spec, tmp_path, monkeypatch, killed_at=130)
 
 
+def test_state_dependent_noise_is_resumed_too(tmp_path, monkeypatch):
+    """SB3 draws it before it tells anybody that a rollout begins, so that a fresh start has to draw it again."""
+    agent = next(one for one in EXPERIMENTS["mountaincar"].contenders if one.overrides.get("use_sde"))
+    short = {"env_kwargs": {"max_episode_steps": 50}}
+    overrides = {**agent.overrides, **short, "buffer_size": 500, "batch_size": 8, "gradient_steps": 1}
+    spec = replace(make_spec(), overrides=overrides, env_id="MountainCarContinuous-v0", env="car", eval_episodes=1)
+    check_resumed_equals_unbroken(spec, tmp_path / "sac", monkeypatch, killed_at=110)
+    ppo = {"policy": "MultiInputPolicy", "policy_kwargs": None, "n_envs": 2, "n_steps": 20, "batch_size": 20, "use_sde": True}
+    spec = replace(
+        make_spec("ppo_rgbd"), overrides={**ppo, **short}, env_id="MountainCarContinuous-v0", env="car", eval_episodes=1
+    )
+    check_resumed_equals_unbroken(spec, tmp_path / "ppo", monkeypatch, killed_at=150)
+
+
 def test_the_seed_decides(tmp_path):
     one, other = (perform(make_spec(seed=seed), tmp_path) for seed in (0, 1))
     assert csv_files(one.folder)["training.csv"] != csv_files(other.folder)["training.csv"]
@@ -228,6 +244,34 @@ def test_other_hyperparameters_are_refused_by_name(tmp_path):
     assert not (result.folder / "crashed.txt").exists()
 
 
+def test_a_finished_run_that_cannot_be_checked_is_left_alone(tmp_path):
+    spec = make_spec(steps=80)
+    folder = perform(spec, tmp_path).folder
+    before = csv_files(folder)
+    result = attempt(make_spec(steps=80, overrides={"bach_size": 8}), tmp_path)  # a slip in a file looks like that
+    assert result.outcome == "unchecked" and "Did you mean 'batch_size'" in result.message
+    assert csv_files(folder) == before and not (folder / "crashed.txt").exists()
+    (folder / "crashed.txt").write_text("of an earlier version, which wrote one then")
+    assert attempt(spec, tmp_path).outcome == "skipped"
+    assert not (folder / "crashed.txt").exists()
+
+
+def test_no_crash_is_told_in_a_folder_that_another_process_writes(tmp_path):
+    spec = make_spec(steps=80, overrides={"bach_size": 8})
+    with locked(spec.folder(tmp_path)):
+        result = attempt(spec, tmp_path)
+        assert result.outcome == "crashed" and "Did you mean 'batch_size'" in result.message
+        assert not list(result.folder.iterdir()) and "crashed.txt" not in result.message
+    assert "Traceback" in (attempt(spec, tmp_path).folder / "crashed.txt").read_text()
+
+
+def test_seeds_of_the_evaluation_are_refused(tmp_path):
+    for seed in (-1, FIRST_SEED - 1, FIRST_SEED):
+        with pytest.raises(ValueError, match=f"seed={seed}: expected 0 or more, and less than 999999"):
+            perform(make_spec(seed=seed), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_another_version_is_mentioned(tmp_path):
     spec = make_spec(steps=80)
     folder = perform(spec, tmp_path).folder
@@ -255,7 +299,7 @@ def test_two_runs_never_write_one_folder(tmp_path):
 
 
 def test_diagnosis_changes_nothing(tmp_path, monkeypatch):
-    spec = make_spec("cpm_sac")
+    spec = make_spec("cpm_sac", overrides={"replay_buffer_kwargs": {"challenge_ratio": 0.9}})
     diagnosed = perform(spec, tmp_path / "a")
     names = set(pd.read_csv(diagnosed.folder / "diagnostics.csv")["name"])
     assert {"player/q_D", "player/q_I", "player/critic_loss_I", "player/actor_loss_D"} <= names
@@ -263,6 +307,10 @@ def test_diagnosis_changes_nothing(tmp_path, monkeypatch):
     plain = perform(spec, tmp_path / "b")
     assert csv_files(diagnosed.folder)["training.csv"] == csv_files(plain.folder)["training.csv"]
     assert csv_files(diagnosed.folder)["evaluations.csv"] == csv_files(plain.folder)["evaluations.csv"]
+    logged, expected = (pd.read_csv(run.folder / "diagnostics.csv") for run in (diagnosed, plain))
+    logged = logged[~logged["name"].str.startswith("player/")].reset_index(drop=True)
+    assert (logged["name"] == "challenge/sampled_age").any()
+    pd.testing.assert_frame_equal(logged, expected)
 
 
 def test_player_losses_are_those_of_sac():
@@ -289,6 +337,31 @@ def test_evaluation_seeds_every_episode():
     evaluate(built.model, env, 1)
     env.seed(FIRST_SEED)
     assert np.array_equal(env.reset()["state"], start)
+    env.close()
+    built.env.close()
+
+
+@pytest.mark.parametrize("keys", [["state"], ["camera", "state"]])
+def test_evaluation_is_normalized_as_training_is(keys):
+    """With images, too, where the normalization is not the outermost of the environments."""
+    ppo = {
+        "policy": "sb3_cpm.zoo.policies.CameraActorCriticPolicy",
+        "policy_kwargs": None,
+        "n_envs": 1,
+        "n_steps": 60,
+        "batch_size": 60,
+        "n_epochs": 1,
+        "normalize": "{'norm_obs': True, 'norm_reward': True, 'norm_obs_keys': ['state']}",
+        "env_kwargs": {"keys": keys},
+    }
+    built = load_agent("ppo_rgbd", "CPMToy-v0", ppo).build(seed=0, device="cpu")
+    env = built.make_eval_env()
+    built.model.learn(60)
+    evaluate(built.model, env, 1)
+    ours, theirs = unwrap_vec_normalize(env), unwrap_vec_normalize(built.env)
+    assert theirs.obs_rms["state"].count > 60
+    assert np.array_equal(ours.obs_rms["state"].mean, theirs.obs_rms["state"].mean)
+    assert not ours.training and not ours.norm_reward and theirs.training and theirs.norm_reward
     env.close()
     built.env.close()
 
@@ -337,7 +410,62 @@ def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
     assert data.tables["evaluations"].groupby("agent")["seed"].nunique().to_dict() == {"CPM": 1, "SAC": 2}
 
 
-def test_figures_of_another_experiments_runs(tmp_path, tiny_experiment):
+def test_trials_are_kept_apart(tmp_path, tiny_experiment, capsys):
+    """``--steps``: neither results nor figure of the experiment are touched, and it can be run as planned afterwards."""
+
+    def reproduce(*options):
+        return main(["reproduce", "--figure", "99", "--seeds", "1", "--jobs", "0", "--results", str(tmp_path), *options])
+
+    figures = tmp_path / "figures"
+    assert reproduce("--agents", "SAC") == 0
+    before = (figures / "figure_99_tiny.png").read_bytes()
+    assert reproduce("--agents", "SAC", "--steps", "60") == 0
+    assert (figures / "figure_99_tiny.png").read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"tiny", "tiny-steps60", "figures"}
+    assert reproduce("--agents", "SAC", "--steps", "60", "--draw-only") == 0
+    assert summary_table("tiny", tmp_path, "full-steps60")["step"].tolist() == [60]
+    assert reproduce("--quick", "--steps", "61", "--agents", "SAC") == 0
+    assert {path.name for path in figures.iterdir()} == {
+        f"figure_99_tiny{name}.png" for name in ("", "-steps60", "-quick-steps61")
+    }
+    assert reproduce("--agents", "SAC", "--steps", "120") == 0, "as planned is no trial"
+    assert not (tmp_path / "tiny-steps120").exists()
+    assert find_data(["tiny"], tmp_path) == {"tiny": "full"}
+    capsys.readouterr()
+    for steps in ("0", "-5"):
+        assert reproduce("--steps", steps) == 1
+        assert f"steps={steps}: expected 1 or more; leave it out for the plan's 120" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="reproduce --figure tiny --quick --steps 7 --results"):
+        draw("tiny", tmp_path, "quick-steps7")
+    with pytest.raises(ValueError, match="no version 'full-steps', but: full, quick"):
+        draw("tiny", tmp_path, "full-steps")
+
+
+def test_agents_that_were_run_differently_are_noted(tmp_path, tiny_experiment):
+    first, second = tiny_experiment.runs(seeds=1)
+    perform(first, tmp_path)
+    perform(second, tmp_path)
+    assert collect(tiny_experiment, tmp_path).notes == []
+    shutil.rmtree(second.folder(tmp_path))
+    perform(replace(second, steps=60, eval_episodes=1), tmp_path)
+    assert collect(tiny_experiment, tmp_path).notes == [
+        "runs with different steps are drawn together (60: CPM; 120: SAC)",
+        "runs with different eval_episodes are drawn together (1: CPM; 2: SAC)",
+    ]
+
+
+def test_what_is_there_is_drawn_where_it_cannot_be_checked(tmp_path, tiny_experiment, monkeypatch, capsys):
+    command = ["reproduce", "--figure", "tiny", "--seeds", "1", "--jobs", "0", "--results", str(tmp_path)]
+    assert main(command) == 0
+    (tmp_path / "figures" / "figure_99_tiny.png").unlink()
+    slip = tuple(replace(one, overrides={**one.overrides, "gama": 0.9}) for one in tiny_experiment.contenders)
+    monkeypatch.setitem(EXPERIMENTS, "tiny", replace(tiny_experiment, contenders=slip))
+    assert main(command) == 1
+    assert "unchecked: tiny/SAC/toy/seed0" in capsys.readouterr().out
+    assert (tmp_path / "figures" / "figure_99_tiny.png").exists() and not list(tmp_path.rglob("crashed.txt"))
+
+
+def test_figures_of_another_experiments_runs(tmp_path, tiny_experiment, capsys):
     assert ensure_data("tiny", tmp_path, seeds=1) == "quick"
     assert find_data(["mountaincar", "tiny"], tmp_path) == {"tiny": "quick"}
     assert draw("tiny", tmp_path, "quick").axes
@@ -348,7 +476,13 @@ def test_figures_of_another_experiments_runs(tmp_path, tiny_experiment):
     assert 0 < values[-1] < values[0] < 1
     with pytest.raises(ValueError, match="no data for 'tiny' on 'toi'"):
         draw("8", tmp_path, source="tiny", version="quick", task="toi")
+    assert main(["reproduce", "--figure", "tiny", "--draw-only", "--results", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "no data for 'tiny'" in error and "but there is of the quick version: add --quick to draw that, or make it" in error
+    assert not (tmp_path / "figures").exists()
     shutil.move(tmp_path / "tiny-quick", tmp_path / "tiny")
+    with pytest.raises(ValueError, match="there is of the full version: leave out --quick to draw that, or make it"):
+        draw("tiny", tmp_path, "quick")
     assert ensure_data("tiny", tmp_path) == "full" == find_data(["tiny"], tmp_path)["tiny"]
     with pytest.raises(ValueError, match="tiny has no version 'short', but: full, quick"):
         draw("tiny", tmp_path, "short")
@@ -494,6 +628,39 @@ def test_every_planned_run_has_valid_hyperparameters(name, version):
     if experiment.source:
         of_source = {(spec.agent, spec.env) for spec in EXPERIMENTS[experiment.source].runs(version)}
         assert {(spec.agent, spec.env) for spec in specs} <= of_source
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_agent_has_a_colour_of_its_own(name):
+    assert len(set(COLOURS)) == len(COLOURS) >= len(EXPERIMENTS[name].contenders)
+    lines = draw_lines(EXPERIMENTS[name])
+    assert len(set(lines)) == len(EXPERIMENTS[name].contenders)
+
+
+def test_the_legend_has_every_agent_once():
+    """Of one task there may be more seeds than of another."""
+    seeds = {"SAC": (2, 1), "CPM-SAC": (1, 1)}
+    rows = [
+        {"agent": agent, "env": task, "seed": seed, "step": step, **dict.fromkeys(SCORES, 0.5)}
+        for agent, numbers in seeds.items()
+        for task, number in zip(("one", "other"), numbers, strict=True)
+        for seed in range(number)
+        for step in (0, 9)
+    ]
+    figure = DRAWINGS["curves"](EXPERIMENTS["pickcube-state"], Data({"evaluations": pd.DataFrame(rows)}, []))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["SAC (1 to 2 seeds)", "CPM-SAC (1 seed)"]
+
+
+def draw_lines(experiment):
+    """The colours of a figure in which every agent has data."""
+    names = [contender.name for contender in experiment.contenders]
+    rows = [
+        {"agent": name, "env": "task", "seed": 0, "step": step, **dict.fromkeys(SCORES, 0.5)}
+        for name in names
+        for step in (0, 9)
+    ]
+    figure = DRAWINGS["curves"](experiment, Data({"evaluations": pd.DataFrame(rows)}, []))
+    return [line.get_color() for line in figure.axes[0].lines]
 
 
 def test_estimate_is_interquartile_and_covers():

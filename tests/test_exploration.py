@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
@@ -161,6 +162,31 @@ def test_c_sees_observations_as_they_were_before_vecnormalize():
     for _ in range(10):
         wrapper.step(np.ones((1, 1), dtype=np.float32))
         np.testing.assert_array_equal(wrapper._pending[0][-1].observation["state"], venv.get_original_obs()["state"][0])
+
+
+class PlainValues(gym.ObservationWrapper):
+    """Observations that are no arrays. SB3 makes arrays of them, except of the last one of an episode."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        extra = {"mode": spaces.Discrete(3), "list": spaces.Box(-1, 1, (2,), np.float32)}
+        self.observation_space = spaces.Dict({**env.observation_space.spaces, **extra})
+
+    def observation(self, observation):
+        return {**observation, "mode": 2, "list": [0.0, self.value]}
+
+    value = 0.5
+
+
+def test_last_observations_of_plain_numbers_and_lists():
+    venv = DummyVecEnv([lambda: PlainValues(gym.make("CPMToy-v0", keys=("state",), max_episode_steps=3))])
+    challenger = Challenger(venv.observation_space, venv.action_space, device="cpu", keys=["state"], **TINY)
+    wrapper = ExplorationVecEnv(venv, challenger, lambda: 0.5, venv.reset())
+    wrapper.active = True
+    assert [wrapper.step(np.zeros((1, 2), dtype=np.float32))[2][0] for _ in range(3)] == [False, False, True]
+    venv.envs[0].value = float("nan")
+    with pytest.raises(ValueError, match="NaN or infinite values in observation 'list' at step 4"):
+        wrapper.step(np.zeros((1, 2), dtype=np.float32))
 
 
 class Broken(gym.Wrapper):

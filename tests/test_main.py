@@ -59,6 +59,32 @@ def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.Cap
     assert [path.name for path in full.iterdir()] == ["notes.txt"]
 
 
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        (["--seed", "-1"], "seed=-1: expected 0 or more"),
+        (["--model-kwargs", "learning_ratee=1"], "model_kwargs: unknown name 'learning_ratee'. Did you mean 'learning_rate'?"),
+        (["--model-kwargs", "policy_kwargs={net_arc: [4]}"], "model_kwargs: unknown name 'net_arc'"),
+        (
+            ["--env-kwargs", "keyss=[state]"],
+            "env_kwargs: CPMToy-v0 takes no 'keyss'. Did you mean 'keys'? Valid: keys, n_points",
+        ),
+        (["--buffer-kwargs", "mixx=row"], "buffer_kwargs: unknown name 'mixx'. Did you mean 'mix'?"),
+        (["--buffer-kwargs", "filter_kwargs={widht: 1}"], "buffer_kwargs: unknown name 'widht'"),
+        (["--callback-kwargs", "train_frek=1"], "callback_kwargs: unknown name 'train_frek'. Did you mean 'train_freq'?"),
+        (["--callback-kwargs", "uncertainty_kwargs={metrik: log}"], "callback_kwargs: unknown name 'metrik'"),
+        (["--steps", "40"], "steps=40 is no longer than learning_starts=50"),
+    ],
+)
+def test_slips_are_told_and_leave_nothing(
+    options: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["train", "--env", "CPMToy-v0", "--evaluations", "0", "--no-video", *options]) == 1
+    assert capsys.readouterr().err.startswith(f"error: {told}")
+    assert not list(tmp_path.glob("runs/*"))
+
+
 def test_train_and_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     trained = []
 

@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+from sb3_cpm.callbacks import max_episode_steps
 from sb3_cpm.envs import ManiSkillEnv, make_maniskill_env
 from sb3_cpm.envs.observations import to_host
 
@@ -363,6 +364,7 @@ def test_vector_environments_agree(env: ManiSkillEnv) -> None:
     seen = []
     for kind in (DummyVecEnv, SubprocVecEnv):
         vec_env = kind([factory, factory])
+        assert max_episode_steps(vec_env) == 50
         vec_env.seed(10)
         frames = [vec_env.reset(), *(vec_env.step(action)[:2] for action in actions)]
         seen.append(frames)

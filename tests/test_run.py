@@ -20,11 +20,12 @@ from sb3_cpm.dreamer import Dreamer
 from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run import environment as environments
 from sb3_cpm.run.environment import make_env
-from sb3_cpm.run.evaluation import play_episode
+from sb3_cpm.run.evaluation import FIRST_SEED, play_episode
 from sb3_cpm.run.folder import atomic, make_run_folder
 from sb3_cpm.run.plots import read_csv, running_mean
 from sb3_cpm.run.recorder import CSVTable
 from sb3_cpm.run.summary import Summary, complete_times
+from sb3_cpm.run.training import make_model
 
 SMALL: dict[str, Any] = {
     "env": "CPMToy-v0",
@@ -210,11 +211,56 @@ def test_bad_settings_leave_no_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"algorithm": "ppo"}, {"n_envs": 0}, {"steps": 0}, {"evaluations": -1}, {"eval_episodes": 0}, {"threads": 0}]
+    "wrong",
+    [
+        *({"algorithm": "ppo"}, {"n_envs": 0}, {"steps": 0}, {"evaluations": -1}, {"eval_episodes": 0}, {"threads": 0}),
+        *({"seed": -1}, {"seed": FIRST_SEED}, {"seed": FIRST_SEED - 2, "n_envs": 2}),
+    ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
         TrainSettings(**wrong)
+
+
+def test_the_greatest_seed_is_none_of_the_evaluation() -> None:
+    seed = FIRST_SEED - 3
+    assert TrainSettings(seed=seed, n_envs=2).seed == seed
+    env = environments.make_vec_env("CPMToy-v0", 1, FIRST_SEED)
+    assert np.array_equal(env.reset()["state"][0], make_env("CPMToy-v0").reset(seed=FIRST_SEED)[0]["state"])  # what is refused
+
+
+@pytest.mark.parametrize("steps, expected", [(2000, 200), (400, 200), (150, 75), (80, 50)])
+def test_a_short_run_learns_from_its_middle_on(steps: int, expected: int) -> None:
+    settings = TrainSettings(env="CPMToy-v0", steps=steps, device="cpu").resolved()
+    assert make_model(settings, environments.make_vec_env("CPMToy-v0", 1, 0)).learning_starts == expected
+
+
+def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(ValueError, match=r"steps=50 is no longer than learning_starts=50, .* Set steps above 50\.$"):
+        train(run_folder=str(folder), **{**SMALL, "steps": 50, "learning_starts": None})
+    with pytest.raises(ValueError, match="Set steps above 100, or learning_starts lower, to 50 at least"):
+        train(run_folder=str(folder), **{**SMALL, "steps": 100})
+    assert not folder.exists()
+    shortest = {**SMALL, "steps": 80, "learning_starts": None, "evaluations": 0, "video": False}
+    assert train(run_folder=str(folder), **shortest).player_updates > 0
+
+
+def test_module_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gymnasium's ``MODULE:ID``, for tasks that a package registers when it is imported."""
+    (tmp_path / "brings_a_task.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Brought-v0', entry_point='gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=20)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    changes = {"env": "brings_a_task:Brought-v0", "steps": 60, "learning_starts": 40, "evaluations": 0}
+    summary = train(**{**SMALL, **changes})
+    assert Path(summary.folder) == Path("runs/Brought-v0-sac-seed0") and summary.episodes == 3
+    with pytest.raises(ValueError, match=r"brings_a_task registers no 'Braught-v0'\. Did you mean 'Brought-v0'"):
+        make_env("brings_a_task:Braught-v0")
+    with pytest.raises(ValueError, match="cannot import 'brings_no_task'"):
+        make_env("brings_no_task:Brought-v0")
 
 
 def test_two_processes_and_tqc(tmp_path: Path) -> None:

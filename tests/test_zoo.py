@@ -551,6 +551,24 @@ def test_errors_of_our_command_are_sentences(capsys: pytest.CaptureFixture[str])
 
 # ---------------------------------------------------------------------- rl_zoo3's commands, from end to end
 COMMON = ["--device", "cpu", "--eval-episodes", "2", "--save-replay-buffer", "-tb", "tb"]
+
+
+@pytest.mark.parametrize("program", ["ours", "theirs"])
+def test_gymnasium_robotics_is_imported_where_it_is_needed(program: str, tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    pytest.importorskip("mujoco")
+    script = "import sys, sb3_cpm.zoo; print([name for name in ('gymnasium_robotics', 'mujoco') if name in sys.modules])"
+    assert run(["-c", script], tmp_path).strip() == "[]"
+    end = ["--env", "PointMaze_UMaze-v3", "-n", "60", "-f", "logs", "--device", "cpu", "--eval-freq", "-1"]
+    if program == "ours":
+        run(["-m", "sb3_cpm.zoo", "train", "--agent", "sac_her", *end], tmp_path)
+    else:
+        packages = ["--gym-packages", "sb3_cpm.zoo", "gymnasium_robotics"]
+        config = str(config_folder() / "sac_her.yml")
+        run(["-m", "rl_zoo3.train", *packages, "--algo", "sac", "--conf-file", config, *end], tmp_path)
+    assert (tmp_path / "logs" / "sac" / "PointMaze_UMaze-v3_1" / "PointMaze_UMaze-v3.zip").exists()
+
+
 RL_ZOO3 = ["-m", "rl_zoo3.{command}", "--gym-packages", "sb3_cpm.zoo"]
 OURS = ["-m", "sb3_cpm.zoo", "{command}"]
 SMALL = "env_kwargs:dict(ignore_terminations=True, n_points=0, image_size=32, max_episode_steps=10)"

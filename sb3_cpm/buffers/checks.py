@@ -43,11 +43,8 @@ def check_arguments(
         if not 0 <= share <= 1:
             raise ValueError(f"{name} is a share of the batches and must lie in [0, 1], got {share}")
     # 0.1 is the default and means nothing without demonstrations
-    if challenge_ratio + demonstration_ratio > 1 and demonstration_ratio != 0.1:
-        raise ValueError(
-            f"challenge_ratio={challenge_ratio} and demonstration_ratio={demonstration_ratio} are shares of the same batches "
-            "and must not exceed 1 together"
-        )
+    if demonstration_ratio != 0.1:
+        check_shares(challenge_ratio, demonstration_ratio)
     if challenge_ratio > 0 and not isinstance(action_space, spaces.Box):
         raise ValueError(
             f"Challenges need continuous actions (a Box action space), got {action_space}. Use SAC, TD3, DDPG or TQC on a "
@@ -60,6 +57,15 @@ def check_arguments(
     if refresh_every is not None and refresh_every < 1:
         raise ValueError(
             f"refresh_every is a number of transitions and must be at least 1, or None for never, got {refresh_every}"
+        )
+
+
+def check_shares(challenge_ratio: float, demonstration_ratio: float) -> None:
+    """:raises ValueError: for shares of a batch that leave no room for each other"""
+    if challenge_ratio + demonstration_ratio > 1:
+        raise ValueError(
+            f"challenge_ratio={challenge_ratio} and demonstration_ratio={demonstration_ratio} are shares of the same batches "
+            f"and must not exceed 1 together; demonstration_ratio={max(1 - challenge_ratio, 0):.4g} is the most that fits"
         )
 
 

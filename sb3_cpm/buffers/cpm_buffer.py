@@ -6,7 +6,7 @@ D is a ``HerReplayBuffer`` that stores every observation once and samples in tim
 part of D that is never overwritten.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
-from sb3_cpm.buffers.checks import check_arguments
+from sb3_cpm.buffers.checks import check_arguments, check_shares
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
@@ -136,10 +136,18 @@ class CPMBuffer(EpisodeBuffer):
         )
         #: Demonstrations, as a buffer of their own; None while there are none.
         self.demonstrations: EpisodeBuffer | None = None
-        #: Set by the callback while it is there to feed the curator; without it nothing would ever enter I.
-        self.has_challenger = False
+        self._has_challenger: Callable[[], bool] = bool  # False
         self.stopwatch: Stopwatch | None = None
         self._forget_challenges()
+
+    @property
+    def has_challenger(self) -> bool:
+        """Whether the callback is there that feeds the curator; without it nothing would ever enter I."""
+        return self._has_challenger()
+
+    @has_challenger.setter
+    def has_challenger(self, there: bool | Callable[[], bool]) -> None:
+        self._has_challenger = there if callable(there) else lambda: there
 
     # ------------------------------------------------------------------ storage
 
@@ -223,7 +231,8 @@ class CPMBuffer(EpisodeBuffer):
         if not n_demonstrated:
             return self._sample_own(n_ours - n_imaginary, n_imaginary, env)
         assert self.demonstrations is not None
-        self.demonstrations.player_keys = self.player_keys
+        # SB3 sets a loaded buffer's device, and knows nothing of a second one in it
+        self.demonstrations.player_keys, self.demonstrations.device = self.player_keys, self.device
         demonstrated = self.demonstrations.sample(n_demonstrated, env)
         return _concatenate(self._sample_own(n_ours - n_imaginary, n_imaginary, env), demonstrated) if n_ours else demonstrated
 
@@ -234,7 +243,8 @@ class CPMBuffer(EpisodeBuffer):
         if not self._valid_ends[-1]:  # nothing in D, hence nothing in I
             return 0, batch_size
         if self.mix == "row":
-            return round(of_challenges * batch_size), round(of_demonstrations * batch_size)
+            n_imaginary = round(of_challenges * batch_size)
+            return n_imaginary, min(round(of_demonstrations * batch_size), batch_size - n_imaginary)
         if of_challenges + of_demonstrations == 0:
             return 0, 0
         draw = np.random.random()
@@ -354,8 +364,10 @@ class CPMBuffer(EpisodeBuffer):
         :param env: a single environment, as made for training, in which the recorded actions are replayed; needed unless the
             file holds this buffer's observations and rewards
         :return: number of episodes added
-        :raises ValueError: for files and episodes that don't fit; nothing is added then
+        :raises ValueError: for files and episodes that don't fit, and if ``challenge_ratio`` and ``demonstration_ratio``
+            exceed 1 together; nothing is added then
         """
+        check_shares(self.challenge_ratio, self.demonstration_ratio)
         if isinstance(source, (str, Path)):
             source = read_demonstrations(source, self.observation_space, self.action_space, env)
         if not source:
@@ -393,7 +405,7 @@ class CPMBuffer(EpisodeBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        del state["stopwatch"], state["has_challenger"]  # these belong to a running learn()
+        del state["stopwatch"], state["_has_challenger"]  # these belong to a running learn()
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -47,6 +47,7 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
         self.batch = batch
         self.action_space = batch.action_space
         self.observation_space = batch.observation_space
+        self._max_episode_steps = batch.max_episode_steps  # where gymnasium's TimeLimit has it
         self._next_state: StartState | None = None
 
     # ------------------------------------------------------------------ gymnasium

@@ -10,6 +10,7 @@ import os
 import pickle
 import shutil
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cpm.callbacks import ChallengerCallback
@@ -43,12 +45,12 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCall
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         normalize.save(str(new / "vecnormalize.pkl"))
-    counters = {}
+    next_training = {}
     for index, callback in enumerate(callbacks):
         if isinstance(callback, ChallengerCallback) and callback.challenger is not None:
             callback.save(new / f"challenger{index}.pt")
-            counters[index] = callback._last_training
-    (new / "state.pkl").write_bytes(pickle.dumps({"counters": counters, **extra}))
+            next_training[index] = callback._next_training
+    (new / "state.pkl").write_bytes(pickle.dumps({"next_training": next_training, **extra}))
     shutil.rmtree(old, ignore_errors=True)
     if current.exists():
         os.replace(current, old)
@@ -70,7 +72,7 @@ def remove_checkpoints(folder: Path) -> None:
 
 
 def load_extra(checkpoint: Path) -> dict[str, Any]:
-    """:return: what was given to :func:`save_checkpoint`, and ``counters``"""
+    """:return: what was given to :func:`save_checkpoint`, and ``next_training`` of the challengers"""
     return pickle.loads((checkpoint / "state.pkl").read_bytes())
 
 
@@ -97,27 +99,32 @@ class ChallengerRestorer(BaseCallback):
     def __init__(self, checkpoint: Path, callbacks: list[BaseCallback]) -> None:
         super().__init__()
         self.checkpoint, self.callbacks = checkpoint, callbacks
-        self.counters: dict[int, int] = load_extra(checkpoint)["counters"]
+        self.next_training: dict[int, int] = load_extra(checkpoint)["next_training"]
 
     def _on_training_start(self) -> None:
-        for index, count in self.counters.items():
+        for index, step in self.next_training.items():
             callback = self.callbacks[index]
             assert isinstance(callback, ChallengerCallback) and callback.challenger is not None
             callback.challenger.load_state(self.checkpoint / f"challenger{index}.pt")
-            callback._last_training = count
+            callback._next_training = step
 
     def _on_step(self) -> bool:
         return True
 
 
-def fresh_start(model: BaseAlgorithm, seed: int) -> None:
+def fresh_start(model: BaseAlgorithm, seed: int, callbacks: Sequence[BaseCallback] = ()) -> None:
     """
     Seed everything from (seed, number of steps so far) and begin new episodes.
 
-    :param model: between two rollouts
+    :param model: before a rollout
     :param seed: of the run
+    :param callbacks: of the run; what a challenger among them has put around the environments begins anew, too
     """
-    assert model.env is not None
+    wrappers = [
+        callback._env for callback in callbacks if isinstance(callback, ChallengerCallback) and callback._env is not None
+    ]
+    env = wrappers[-1] if wrappers else model.env
+    assert env is not None
     words = np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)
     model.set_random_seed(int(words[0]) % (FIRST_SEED - model.n_envs))  # evaluation has the seeds from there on
     buffer = getattr(model, "replay_buffer", None)
@@ -128,8 +135,11 @@ def fresh_start(model: BaseAlgorithm, seed: int) -> None:
     noise = getattr(model, "action_noise", None)
     if noise is not None:
         noise.reset()
-    model._last_obs = model.env.reset()  # type: ignore[assignment]
+    model._last_obs = env.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         model._last_original_obs = normalize.get_original_obs()
+    if model.use_sde:  # SB3 has drawn the noise of the rollout that begins, before it told anybody
+        noisy = model.policy if isinstance(model, OnPolicyAlgorithm) else model.policy.actor
+        noisy.reset_noise(model.n_envs)  # type: ignore[operator, union-attr]

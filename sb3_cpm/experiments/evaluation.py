@@ -5,11 +5,12 @@ Unlike SB3's ``evaluate_policy`` it seeds every episode, and tells success at th
 ``success`` is not sticky, an arm can reach its goal and leave it again.
 """
 
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_cpm.run.evaluation import FIRST_SEED
 
@@ -45,10 +46,11 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int, first_seed: int
     :param n_episodes: how many
     :param first_seed: training has the seeds below ``FIRST_SEED``
     """
-    if isinstance(env, VecNormalize) and model.get_vec_normalize_env() is not None:
-        assert model.env is not None
-        sync_envs_normalization(model.env, env)
-        env.training = env.norm_reward = False
+    ours, theirs = unwrap_vec_normalize(env), model.get_vec_normalize_env()  # images are transposed outside of either
+    if ours is not None and theirs is not None:
+        if hasattr(theirs, "obs_rms"):  # not where only rewards are normalized
+            ours.obs_rms = copy.deepcopy(theirs.obs_rms)
+        ours.training = ours.norm_reward = False
     return [_play(model, env, first_seed + index) for index in range(n_episodes)]
 
 

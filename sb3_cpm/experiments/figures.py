@@ -4,6 +4,7 @@ Figures of the experiments, from their CSV files alone.
 Lines are interquartile means over seeds, bands 95% stratified bootstrap intervals (see :mod:`sb3_cpm.experiments.statistics`).
 """
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,9 +20,9 @@ from matplotlib.ticker import MaxNLocator
 from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.specification import Experiment
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
-from sb3_cpm.run.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE
+from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, PURPLE, RED, STYLE
 
-COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY)
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, PINK, BLACK)
 LEGEND_COLUMNS = 4
 #: Columns of evaluations.csv with the words for them.
 SCORES = {
@@ -136,7 +137,10 @@ def _agents(experiment: Experiment, table: pd.DataFrame) -> list[str]:
 
 def _colours(experiment: Experiment) -> dict[str, str]:
     """An agent has the same colour in all panels, whether or not the others have data."""
-    return {contender.name: COLOURS[index % len(COLOURS)] for index, contender in enumerate(experiment.contenders)}
+    agents = [contender.name for contender in experiment.contenders]
+    if len(agents) > len(COLOURS):
+        raise ValueError(f"{experiment.name} has {len(agents)} agents: expected at most {len(COLOURS)}, one per colour")
+    return dict(zip(agents, COLOURS, strict=False))
 
 
 def _line(axes: Axes, scores: pd.DataFrame, colour: str, label: str | None, style: str = "-") -> None:
@@ -148,8 +152,11 @@ def _line(axes: Axes, scores: pd.DataFrame, colour: str, label: str | None, styl
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, lw=0)
 
 
-def _seeds(number: int) -> str:
-    return "1 seed" if number == 1 else f"{number} seeds"
+def _seeds(*numbers: int) -> str:
+    """:param numbers: in ascending order; panels may differ"""
+    if numbers == (1,):
+        return "1 seed"
+    return f"{numbers[0]} seeds" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} seeds"
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
@@ -188,18 +195,23 @@ def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFr
 
 
 def _finished(figure: Figure, grid: np.ndarray) -> Figure:
-    """With the x axis' name and a few ticks, and one legend below that has every label once."""
+    """With the x axis' name and a few ticks, and one legend below that has every agent once."""
     for axes in grid[-1]:
         axes.set_xlabel("environment steps")
     for axes in grid.flat:
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     handles: dict[str, Artist] = {}
+    numbers: dict[str, set[int]] = {}
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
+            told = re.fullmatch(r"(.*) \((\d+) seeds?\)", label)
+            name = label if told is None else told[1]
+            handles.setdefault(name, handle)
+            numbers.setdefault(name, set()).update([] if told is None else [int(told[2])])
     if handles:
+        labels = [f"{name} ({_seeds(*sorted(numbers[name]))})" if numbers[name] else name for name in handles]
         columns = min(len(handles), LEGEND_COLUMNS)
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=9)
+        figure.legend(handles.values(), labels, loc="outside lower center", ncols=columns, fontsize=9)
     return figure
 
 

@@ -13,13 +13,13 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_cpm.experiments.run_folder import LockedError, OtherResultError, write_crashed
+from sb3_cpm.experiments.run_folder import LockedError, OtherResultError, is_finished, write_crashed
 from sb3_cpm.experiments.single_run import RunResult, perform
 from sb3_cpm.experiments.specification import RunSpec
 
 Tell = Callable[[str], None]
 #: What a worker process ends with, by outcome; every other status is a crash.
-STATUS = {"finished": 0, "skipped": 10, "refused": 11}
+STATUS = {"finished": 0, "skipped": 10, "refused": 11, "unchecked": 12}
 
 
 def perform_all(
@@ -51,12 +51,15 @@ def attempt(spec: RunSpec, results: Path, tell: Tell = print, device: str = "cpu
     except (OtherResultError, LockedError) as error:
         return RunResult(spec, "refused", str(error), folder)
     except Exception as error:
+        if is_finished(folder):
+            told = f"its result is there; whether it was made with what is asked for now cannot be told ({error})"
+            return RunResult(spec, "unchecked", told, folder)
         return _crashed(spec, folder, traceback.format_exc(), error)
 
 
 def _crashed(spec: RunSpec, folder: Path, text: str, error: Exception) -> RunResult:
-    write_crashed(folder, text)
-    return RunResult(spec, "crashed", f"{type(error).__name__}: {error} (see {folder / 'crashed.txt'})", folder)
+    see = f" (see {folder / 'crashed.txt'})" if write_crashed(folder, text) else ""
+    return RunResult(spec, "crashed", f"{type(error).__name__}: {error}{see}", folder)
 
 
 class _Pool:

@@ -1,9 +1,11 @@
 """
 What the player's losses and values are on D and on I (Figure 11): batches of either kind, rated by the networks as they are.
 
-Nothing is trained and no random state is touched, so that a run with this diagnosis is the same as one without.
+Nothing is trained, no random state is touched and nothing is counted, so that a run with this diagnosis is the same as one
+without, and logs the same beside it.
 """
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -28,9 +30,10 @@ def log_player_losses(model: BaseAlgorithm) -> None:
     buffer = getattr(model, "replay_buffer", None)
     if not (isinstance(model, SAC) and isinstance(buffer, CPMBuffer) and buffer.challenges):
         return
-    ratios = buffer.challenge_ratio, buffer.demonstration_ratio
+    ratios, imaginary = (buffer.challenge_ratio, buffer.demonstration_ratio), buffer._imaginary
     with _unnoticed():
         try:
+            buffer._imaginary = copy.copy(imaginary)  # it counts the ages of what is sampled, which the run logs as P's
             for name, share in (("D", 0.0), ("I", 1.0)):
                 buffer.challenge_ratio, buffer.demonstration_ratio = share, 0.0
                 batch = buffer.sample(BATCH_SIZE, env=model.get_vec_normalize_env())
@@ -38,6 +41,7 @@ def log_player_losses(model: BaseAlgorithm) -> None:
                     model.logger.record(f"player/{kind}_{name}", value)
         finally:
             buffer.challenge_ratio, buffer.demonstration_ratio = ratios
+            buffer._imaginary = imaginary
 
 
 def player_losses(model: SAC, batch: DictReplayBufferSamples) -> dict[str, float]:

@@ -1,13 +1,14 @@
 """An experiment from start to figure, and its numbers as a table: what notebooks and the command line call."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
-from sb3_cpm.experiments.collect import NoDataError, collect
+from sb3_cpm.experiments.collect import collect, has_data
 from sb3_cpm.experiments.grid import perform_all
 from sb3_cpm.experiments.single_run import RunResult
 from sb3_cpm.experiments.specification import Experiment, of_version
@@ -42,12 +43,13 @@ def run_experiment(
     :param seeds: how many; None: as planned
     :param jobs: processes at a time; 0: in this process
     :param tell: is given lines about the progress
-    :param steps: of each run, to try something; None: as planned
+    :param steps: of each run, to try something; None: as planned. Trials go to a folder of their own, ``NAME-stepsN``
     :param device: PyTorch device of the runs
     :param agents: only these, by name
     :param tasks: only these, by name
     :return: what became of each run; a crashed one does not stop the others
-    :raises ValueError: for an unknown name, with the nearest, and for a version that the experiment does not have
+    :raises ValueError: for an unknown name, with the nearest, for a version that the experiment does not have, and for fewer
+        seeds or steps than one
     """
     experiment = find_experiment(name)
     if seeds is not None and seeds < 1:
@@ -70,7 +72,7 @@ def ensure_data(
     :param name: of an experiment, or a figure's number
     :param results: folder of all results
     :param seeds: of the quick version, where it has to be run
-    :param steps: likewise
+    :param steps: likewise; to be given together with a folder of results of its own
     :param jobs: likewise; 0: in this process
     :param tell: is given lines about the progress
     :return: the version for :func:`draw`: "full" or "short" where there are results of it, else "quick", which has then been
@@ -80,19 +82,13 @@ def ensure_data(
     best = find_data([name], results).get(name, "quick")
     if best != "quick":
         return best
-    for outcome in run_experiment(name, "quick", results, seeds, jobs, tell, steps):
+    experiment = find_experiment(name)
+    folder = experiment.folder_name("quick")  # of trials, too: notebooks draw one version
+    specs = [replace(spec, experiment=folder) for spec in experiment.runs("quick", seeds, steps)]
+    for outcome in perform_all(specs, Path(results), jobs, tell):
         if outcome.outcome in ("crashed", "refused"):
             raise RuntimeError(f"{outcome.spec.name} {outcome.outcome}: {outcome.message}")
     return "quick"
-
-
-def _is_there(name: str, results: str | Path, version: str) -> bool:
-    """Whether there is anything to draw."""
-    try:
-        collect(find_experiment(name), results, version)
-    except NoDataError:
-        return False
-    return True
 
 
 def find_data(names: Iterable[str], results: str | Path = RESULTS) -> dict[str, str]:
@@ -103,7 +99,10 @@ def find_data(names: Iterable[str], results: str | Path = RESULTS) -> dict[str, 
     :param results: folder of all results
     :return: the best version that there are results of, for those that have any
     """
-    best = {name: next((one for one in find_experiment(name).plans if _is_there(name, results, one)), None) for name in names}
+    best = {}
+    for name in names:
+        experiment = find_experiment(name)
+        best[name] = next((version for version in experiment.plans if has_data(experiment, results, version)), None)
     return {name: version for name, version in best.items() if version is not None}
 
 
@@ -121,7 +120,7 @@ def draw(
     :param source: name of another experiment whose runs are drawn in this figure's way
     :param task: only the runs on this one; for the figures of logged numbers where an experiment has several
     :return: the figure, from the CSV files alone
-    :raises ValueError: where there is no data, with the command that makes it
+    :raises ValueError: where there is no data, with the version that there is data of, and the command that makes it
     """
     from sb3_cpm.experiments.figures import add_note, draw_experiment
 
@@ -190,26 +189,28 @@ def reproduce(
     """
     Run what is missing, draw the figure, print the table: what ``python -m sb3_cpm reproduce`` does.
 
-    Of what is drawn, ``agents`` and ``tasks`` change nothing: all results that are there are.
+    Of what is drawn, ``agents`` and ``tasks`` change nothing: all results that are there are. With other ``steps`` than
+    planned it is a trial, whose runs and figure are kept apart from the experiment's.
 
-    :return: exit status: 1 if a run crashed or was refused
+    :return: exit status: 1 if a run crashed or was refused, or its result is there and could not be checked
     :raises ValueError: as :func:`run_experiment` and :func:`draw`
     """
     experiment = find_experiment(name)
+    version = experiment.trial(version, steps)
     failed: list[RunResult] = []
     if not draw_only:
         plan = experiment.plan(version)
-        n_runs = len(list(experiment.runs(version, seeds, steps, agents, tasks)))
-        tell(f"{experiment.name}: {n_runs} runs of {steps or plan.steps} steps ({plan.cost}); what is there is skipped")
-        outcomes = run_experiment(name, version, results, seeds, jobs, tell, steps, device, agents, tasks)
-        failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused")]
+        n_runs = len(list(experiment.runs(version, seeds, None, agents, tasks)))
+        tell(f"{experiment.name}: {n_runs} runs of {plan.steps} steps ({plan.cost}); what is there is skipped")
+        outcomes = run_experiment(name, version, results, seeds, jobs, tell, None, device, agents, tasks)
+        failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused", "unchecked")]
         for outcome in failed:
             tell(f"{outcome.outcome}: {outcome.spec.name}: {outcome.message}")
-        if len(failed) == len(outcomes):
+        if len(failed) == len(outcomes) and not has_data(experiment, results, version):
             raise RuntimeError(f"None of the {len(outcomes)} runs of {experiment.name} could be made; see above.")
     path = figure_path(experiment, results, version)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure = draw(name, results, version)
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_figure(figure, path)
     tell(summary_table(name, results, version).to_string(index=False))
     for note in collect(experiment, results, version).notes:

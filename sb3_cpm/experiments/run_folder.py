@@ -137,9 +137,24 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 
 def write_finished(folder: Path, facts: dict[str, Any]) -> None:
     write_yaml(folder / FINISHED, facts)
+    remove_crashed(folder)
+
+
+def write_crashed(folder: Path, text: str) -> bool:
+    """
+    :param folder: of the run; one that is finished or being written by another process is left as it is
+    :param text: what happened
+    :return: whether it was written
+    """
+    try:
+        with locked(folder):
+            if is_finished(folder):
+                return False
+            write_text(folder / CRASHED, text)
+            return True
+    except LockedError:
+        return False
+
+
+def remove_crashed(folder: Path) -> None:
     (folder / CRASHED).unlink(missing_ok=True)
-
-
-def write_crashed(folder: Path, text: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / CRASHED, text)

@@ -20,6 +20,7 @@ from sb3_cpm.experiments.player_losses import log_player_losses
 from sb3_cpm.experiments.specification import RunSpec
 from sb3_cpm.experiments.tables import DIAGNOSTICS, EVALUATIONS, TRAINING, DiagnosticsWriter, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
+from sb3_cpm.run.evaluation import FIRST_SEED
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
@@ -32,7 +33,8 @@ class RunResult(NamedTuple):
     What became of a run.
 
     :param spec: the run
-    :param outcome: ``"finished"``, ``"skipped"`` (its result was there), ``"refused"`` or ``"crashed"``
+    :param outcome: ``"finished"``, ``"skipped"`` (its result was there), ``"unchecked"`` (it was there, but what is asked for
+        cannot be read, to compare them), ``"refused"`` or ``"crashed"``
     :param message: what else there is to say
     :param folder: where its results are
     """
@@ -52,14 +54,20 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     :param tell: is given a line now and then
     :param device: PyTorch device; small networks are fastest on the CPU
     :raises LockedError: while another process makes the same run
-    :raises ValueError: for an unknown agent or environment, for wrong hyperparameters, and if the folder holds a run with
-        other ones
+    :raises ValueError: for an unknown agent or environment, for wrong hyperparameters, for a seed that evaluation may have,
+        and if the folder holds a run with other hyperparameters
     """
     folder = spec.folder(results)
     agent = load_agent(spec.config, spec.env_id, spec.overrides)
+    if not 0 <= spec.seed < FIRST_SEED - agent.n_envs:
+        raise ValueError(
+            f"seed={spec.seed}: expected 0 or more, and less than {FIRST_SEED - agent.n_envs}: the evaluation's episodes have "
+            "the seeds from there on, and training never sees these"
+        )
     config = run_folder.description(spec, agent)
     note = run_folder.check_belongs(folder, config)
     if run_folder.is_finished(folder):
+        run_folder.remove_crashed(folder)  # of a try that ended before it saw that
         return RunResult(spec, "skipped", note or "its result is there", folder)
     th.set_num_threads(1)
     th.set_flush_denormal(True)  # Adam's averages of units that are off decay to numbers that cost CPUs a tenth of an update
@@ -186,7 +194,7 @@ class Watcher(BaseCallback):
             self.model.dump_logs()
 
     def _start_afresh(self) -> None:
-        checkpoints.fresh_start(self.model, self.spec.seed)
+        checkpoints.fresh_start(self.model, self.spec.seed, self.built.callbacks)
         self._succeeded = [None] * len(self._succeeded)
 
     def _evaluate(self) -> None:

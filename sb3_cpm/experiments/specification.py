@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,11 +12,19 @@ from sb3_cpm.run.evaluation import FIRST_SEED
 
 #: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.
 VERSIONS = ("full", "short", "quick")
+#: Between a version and the number of steps of a trial of it, ``"short-steps500"``.
+TRIAL = "-steps"
 
 
 def of_version(name: str, version: str) -> str:
     """:return: what a version's results and figure are called: as the experiment where it is the full one"""
-    return name if version == "full" else f"{name}-{version}"
+    return name + f"-{version}".removeprefix("-full")
+
+
+def options_of(version: str) -> str:
+    """:return: what ``python -m sb3_cpm reproduce`` has to be given for a version, with a space before each option"""
+    planned, trial, steps = version.partition(TRIAL)
+    return ("" if planned == "full" else f" --{planned}") + (f" --steps {steps}" if trial else "")
 
 
 @dataclass(frozen=True)
@@ -165,16 +173,33 @@ class Experiment:
 
     def plan(self, version: str = "full") -> Plan:
         """
-        :param version: one of :data:`VERSIONS`
+        :param version: one of :data:`VERSIONS`, or a trial of it, see :meth:`trial`
         :raises ValueError: if this experiment has no such version
         """
-        if version not in self.plans:
+        planned, trial, steps = version.partition(TRIAL)
+        if planned not in self.plans or (trial and not steps.isdecimal()):
             raise ValueError(f"{self.name} has no version {version!r}, but: {', '.join(self.plans)}.")
-        return self.plans[version]
+        plan = self.plans[planned]
+        return replace(plan, steps=int(steps), cost="a trial, apart from the experiment's results") if trial else plan
+
+    def trial(self, version: str, steps: int | None) -> str:
+        """
+        Runs of other lengths than planned are a version of their own, so that they never get among the results.
+
+        :param version: one of :data:`VERSIONS`
+        :param steps: of each run; None: as planned
+        :return: the name of the version: as given where the runs are as long as planned, else like ``"short-steps500"``
+        :raises ValueError: for fewer steps than one, and if this experiment has no such version
+        """
+        if steps is None or steps == self.plan(version).steps:
+            return version
+        if steps < 1:
+            raise ValueError(f"steps={steps}: expected 1 or more; leave it out for the plan's {self.plan(version).steps}")
+        return f"{version}{TRIAL}{steps}"
 
     def folder_name(self, version: str = "full") -> str:
         """
-        :param version: one of :data:`VERSIONS`
+        :param version: one of :data:`VERSIONS`, or a trial of it
         :return: where the results are; those of several versions are never mixed
         :raises ValueError: if this experiment has no such version
         """
@@ -192,14 +217,15 @@ class Experiment:
         """
         :param version: one of :data:`VERSIONS`
         :param seeds: how many, from the plan's first; None: the plan's number
-        :param steps: of each run; None: the plan's number
+        :param steps: of each run; None: the plan's number. Others are a version of their own, see :meth:`trial`
         :param agents: names of contenders; None: all
         :param tasks: names of tasks; None: all
         :return: all runs, first seeds first
-        :raises ValueError: for a version that this experiment does not have, or a name, with the nearest
+        :raises ValueError: for a version that this experiment does not have, fewer steps than one, or a name, with the nearest
         """
         from sb3_cpm.zoo.agents import algorithm_of
 
+        version = self.trial(version, steps)
         plan = self.plan(version)
         contenders = _chosen("agent", agents, self.contenders)
         chosen_tasks = _chosen("task", tasks, plan.tasks)
@@ -216,7 +242,7 @@ class Experiment:
                         overrides=_merged(
                             plan.overrides.get(algorithm_of(contender.config), {}), task.overrides, contender.overrides
                         ),
-                        steps=steps or plan.steps,
+                        steps=plan.steps,
                         eval_every=plan.eval_every,
                         eval_episodes=plan.eval_episodes,
                         eval_seed=plan.eval_seed,

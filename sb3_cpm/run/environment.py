@@ -1,7 +1,10 @@
 """Environments of a run, by name."""
 
+import contextlib
+import importlib
+import inspect
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -13,18 +16,26 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
 from sb3_cpm.envs.wrappers import DictObservation
+from sb3_cpm.presets import nearest
+from sb3_cpm.run.arguments import unexpected_argument
 
 
 def make_env(env_id: str, render_mode: str | None = None, **kwargs: Any) -> gym.Env:
     """
     Make an environment with a Dict observation space.
 
-    :param env_id: a gymnasium id, or else the name of a ManiSkill task
+    :param env_id: a gymnasium id, or else the name of a ManiSkill task; ``MODULE:ID`` imports first what registers it
     :param render_mode: ``"rgb_array"`` for videos; left away where the environment cannot
     :param kwargs: arguments of the environment
     :return: the environment; a Box observation becomes a Dict with the key ``"state"``
-    :raises ValueError: for an unknown name, or spaces that the method cannot use
+    :raises ValueError: for an unknown name or argument, or spaces that the method cannot use
     """
+    env_id = registered(env_id)
+    with _arguments_explained(env_id, kwargs):
+        return _make_env(env_id, render_mode, **kwargs)
+
+
+def _make_env(env_id: str, render_mode: str | None, **kwargs: Any) -> gym.Env:
     if is_maniskill(env_id):
         from sb3_cpm.envs import make_maniskill_env
 
@@ -68,18 +79,48 @@ def make_vec_env(env_id: str, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
     return env
 
 
-def max_episode_steps(env: VecEnv) -> int | None:
-    """:return: the time limit of the environments, None where there is none"""
-    limits = [spec.max_episode_steps for spec in env.get_attr("spec") if spec is not None]
-    known = [limit for limit in limits if limit is not None]
-    return max(known) if known else None
+def registered(env_id: str) -> str:
+    """
+    >>> registered("sb3_cpm.envs.toy:CPMToy-v0")
+    'CPMToy-v0'
+
+    :param env_id: an id, or ``MODULE:ID`` for one that this module registers when it is imported
+    :return: the id alone
+    :raises ValueError: if there is no such module, or it does not register that
+    """
+    module, colon, name = env_id.rpartition(":")
+    if not colon:
+        return env_id
+    try:
+        importlib.import_module(module)
+    except (ImportError, ValueError) as error:
+        raise ValueError(f"env={env_id!r}: cannot import {module!r}, which should register {name!r} ({error})") from error
+    if name not in gym.registry:
+        raise ValueError(f"env={env_id!r}: {module} registers no {name!r}.{nearest(name, gym.registry)}")
+    return name
+
+
+@contextlib.contextmanager
+def _arguments_explained(env_id: str, kwargs: dict[str, Any]) -> Iterator[None]:
+    """An argument that the environment does not take is a slip of whoever started the run; other errors are not."""
+    try:
+        yield
+    except TypeError as error:
+        unknown = unexpected_argument(error)
+        if unknown is None or unknown not in kwargs:
+            raise
+        entry_point = "sb3_cpm.envs:make_maniskill_env" if is_maniskill(env_id) else gym.spec(env_id).entry_point
+        taker = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+        valid = [] if taker is None else sorted(set(inspect.signature(taker).parameters) - {"env_id", "task_kwargs"})
+        told = f" Valid: {', '.join(valid)}." if valid else ""
+        raise ValueError(f"env_kwargs: {env_id} takes no {unknown!r}.{nearest(unknown, valid)}{told}") from error
 
 
 def is_maniskill(env_id: str) -> bool:
     """Is this no gymnasium id, or one that ManiSkill has registered (with a function of its own)?"""
     spec = gym.registry.get(env_id)
     if spec is None:
-        return ":" not in env_id
+        return True
     return getattr(getattr(spec.entry_point, "func", None), "__module__", "").startswith("mani_skill")
 
 

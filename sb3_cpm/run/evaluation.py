@@ -11,9 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.run.recorder import CSVTable
-
-#: Evaluation seeds start here; training seeds are small numbers.
-FIRST_SEED = 1_000_000
+from sb3_cpm.run.settings import FIRST_SEED as FIRST_SEED
 
 
 class EpisodeResult(NamedTuple):

@@ -43,7 +43,7 @@ def make_run_folder(settings: TrainSettings) -> Path:
             )
         folder.mkdir(parents=True, exist_ok=True)
         return folder
-    name = f"{settings.env.replace('/', '-')}-{settings.algorithm}-seed{settings.seed}"
+    name = f"{settings.env.rpartition(':')[2].replace('/', '-')}-{settings.algorithm}-seed{settings.seed}"
     number = 1
     while True:
         folder = Path("runs") / (name if number == 1 else f"{name}-{number}")

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from sb3_cpm.run.folder import atomic, write_text
 
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#2b6cb0", "#dd6b20", "#2f855a", "#c53030", "#718096", "#6b46c1"
+PINK, BLACK = "#d53f8c", "#1a202c"
 STYLE: dict[str, Any] = {
     "figure.dpi": 110,
     "font.size": 10,

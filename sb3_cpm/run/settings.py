@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 ALGORITHMS = ("sac", "td3", "tqc")
+#: Evaluation seeds start here; training has those below.
+FIRST_SEED = 1_000_000
 
 #: What differs from the defaults below, for tasks that the package knows.
 TASK_DEFAULTS: dict[str, dict[str, Any]] = {
@@ -25,9 +27,10 @@ class TrainSettings:
     """
     Settings of :func:`~sb3_cpm.run.training.train`.
 
-    :param env: a ManiSkill task, ``CPMToy-v0``, or any gymnasium id with continuous actions
+    :param env: a ManiSkill task, ``CPMToy-v0``, or any gymnasium id with continuous actions; ``MODULE:ID`` imports first what
+        registers it
     :param steps: environment steps to train for, over all environments; None: the task's own number, else 10000
-    :param seed: rules the whole run
+    :param seed: rules the whole run; below 1000000, where the seeds of the evaluation begin
     :param run_folder: where the results go; None: the next free name below ``runs/``
     :param n_envs: parallel environments, in processes of their own when more than one
     :param algorithm: the player: ``"sac"``, ``"td3"`` or ``"tqc"`` (needs sb3-contrib)
@@ -44,7 +47,8 @@ class TrainSettings:
         tasks are small: beside SB3's first value of 1 a short run would see nothing but entropy
     :param train_freq: environment steps between two updates of the player
     :param gradient_steps: updates then
-    :param learning_starts: steps before the first update; None: four episodes
+    :param learning_starts: steps before the first update; None: four episodes, or half of the run if that is less and an
+        episode fits in
     :param challenger_train_freq: environment steps between two updates of the challenger
     :param challenger_gradient_steps: updates then
     :param evaluations: how often the deterministic player is evaluated, start and end included; 0 for never
@@ -97,6 +101,11 @@ class TrainSettings:
         for name in ("n_envs", "batch_size", "train_freq", "challenger_train_freq", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected 1 or more")
+        if not 0 <= self.seed < FIRST_SEED - self.n_envs:
+            raise ValueError(
+                f"seed={self.seed}: expected 0 or more, and less than {FIRST_SEED - self.n_envs}: the "
+                "evaluation's episodes have the seeds from there on, and training never sees these"
+            )
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: expected 1 or more")
         if self.evaluations < 0 or (self.evaluations and self.eval_episodes < 1):
@@ -107,7 +116,7 @@ class TrainSettings:
 
     def resolved(self) -> "TrainSettings":
         """:return: the same with the task's own defaults in place of None"""
-        task = TASK_DEFAULTS.get(self.env, {})
+        task = TASK_DEFAULTS.get(self.env.rpartition(":")[2], {})
         own = {name: value for name, value in task.items() if name != "env_kwargs" and getattr(self, name) is None}
         settings = replace(self, **own, env_kwargs={**task.get("env_kwargs", {}), **self.env_kwargs})
         steps = settings.steps or 10_000

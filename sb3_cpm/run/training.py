@@ -24,11 +24,12 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.buffers import CPMBuffer
-from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
-from sb3_cpm.run.environment import make_env, make_vec_env, max_episode_steps
+from sb3_cpm.run.arguments import check_arguments, misspelt_names_told
+from sb3_cpm.run.environment import make_env, make_vec_env
 from sb3_cpm.run.evaluation import FIRST_SEED, Evaluator, play_episode, success_rate
 from sb3_cpm.run.gallery import challenge_gallery
 from sb3_cpm.run.recorder import Recorder
@@ -38,6 +39,10 @@ from sb3_cpm.run.video import write_video
 
 #: Trajectories in the challenge gallery.
 N_SHOTS = 6
+#: What ``model_kwargs`` cannot change: the run's own.
+_OF_RUN = ("policy", "env", "replay_buffer_class", "replay_buffer_kwargs", "_init_setup_model")
+#: What ``buffer_kwargs`` cannot change: SB3 gives it.
+_OF_SB3 = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
 
 
 def train(settings: TrainSettings | None = None, callback: BaseCallback | None = None, **changes: Any) -> Summary:
@@ -55,7 +60,9 @@ def train(settings: TrainSettings | None = None, callback: BaseCallback | None =
     """
     if settings is not None and changes:
         raise ValueError(f"Give either settings or single values, not both: {sorted(changes)}")
-    return Run((settings or TrainSettings(**changes)).resolved()).execute(callback)
+    settings = (settings or TrainSettings(**changes)).resolved()
+    with misspelt_names_told(settings.as_dict()):
+        return Run(settings).execute(callback)
 
 
 class Run:
@@ -77,6 +84,7 @@ class Run:
             self.env = make_vec_env(settings.env, settings.n_envs, settings.seed, **settings.env_kwargs)
             undo.callback(self.env.close)
             self.model = make_model(settings, self.env)
+            _check_length(settings, self.model)
             self.evaluation_env = make_env(settings.env, render_mode="rgb_array", **settings.env_kwargs)
             undo.callback(self.evaluation_env.close)
             self.challenger = make_challenger(settings)
@@ -240,10 +248,10 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
     :param settings: of the run
     :param env: the training environments
     """
-    limit = max_episode_steps(env) or 200
     learning_starts = settings.learning_starts
     if learning_starts is None:
-        learning_starts = 4 * limit * settings.n_envs
+        episode = (max_episode_steps(env) or 200) * settings.n_envs  # the challenger needs a whole one
+        learning_starts = max(min(4 * episode, (settings.steps or 0) // 2), episode)
     kwargs: dict[str, Any] = {
         "buffer_size": settings.buffer_size,
         "batch_size": settings.batch_size,
@@ -259,12 +267,27 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
     if settings.algorithm != "td3":
         coefficient = settings.ent_coef or "auto"
         kwargs["ent_coef"] = coefficient if coefficient.startswith("auto") else float(coefficient)
+    algorithm = _algorithm(settings.algorithm)
+    check_arguments("model_kwargs", settings.model_kwargs, algorithm, _OF_RUN)
+    check_arguments("buffer_kwargs", settings.buffer_kwargs, CPMBuffer, _OF_SB3)
     kwargs.update(settings.model_kwargs)
     kwargs["replay_buffer_class"] = CPMBuffer
     kwargs["replay_buffer_kwargs"] = {"challenge_ratio": settings.challenge_ratio, **settings.buffer_kwargs}
     policy, policy_kwargs = _policy(settings.algorithm, env)
     kwargs["policy_kwargs"] = {**policy_kwargs, **settings.model_kwargs.get("policy_kwargs", {})}
-    return _algorithm(settings.algorithm)(policy, env, **kwargs)
+    return algorithm(policy, env, **kwargs)
+
+
+def _check_length(settings: TrainSettings, model: OffPolicyAlgorithm) -> None:
+    """A run that ends before the first update would look finished."""
+    if (settings.steps or 0) <= model.learning_starts:
+        episode = (max_episode_steps(model.env) or 200) * settings.n_envs  # type: ignore[arg-type]
+        raise ValueError(
+            f"steps={settings.steps} is no longer than learning_starts={model.learning_starts}, the steps before the first "
+            f"update: nothing would be learned. Set steps above {model.learning_starts}"
+            + (f", or learning_starts lower, to {episode} at least (an episode)" if model.learning_starts > episode else "")
+            + "."
+        )
 
 
 def _policy(algorithm: str, env: VecEnv) -> tuple[Any, dict[str, Any]]:
@@ -304,6 +327,7 @@ def make_challenger(settings: TrainSettings) -> ChallengerCallback:
         "gradient_steps": settings.challenger_gradient_steps,
         **settings.callback_kwargs,
     }
+    check_arguments("callback_kwargs", settings.callback_kwargs, ChallengerCallback)
     return ChallengerCallback(**kwargs)
 
 

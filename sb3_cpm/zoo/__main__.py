@@ -4,6 +4,7 @@ rl_zoo3's commands, with our algorithms among the choices of ``--algo`` and our 
     python -m sb3_cpm.zoo train --algo dreamer --env CPM/PickCube-v1
     python -m sb3_cpm.zoo train --agent cpm_sac --env CPM/PickCube-v1
     python -m sb3_cpm.zoo enjoy --algo dreamer --env CPM/PickCube-v1 --no-render
+    python -m sb3_cpm.zoo train --agent sac_her --env PointMaze_UMaze-v3      gymnasium-robotics is imported
 
 All options are rl_zoo3's own but one: ``--agent NAME`` stands for ``--algo ALGO --conf-file zoo_configs/NAME.yml``. And
 ``train --algo dreamer`` or ``plan2explore`` without ``--conf-file`` takes the file of that name, since rl_zoo3 has none.
@@ -42,8 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         sys.stderr.write(f'error: rl_zoo3 is missing ({error}): pip install "sb3_cpm[zoo]"\n')
         return 1
+    from sb3_cpm.zoo.registration import register_robotics
+
     try:
         sys.argv = [f"{sys.argv[0]} {command}", *complete(command, rest)]
+        register_robotics(_environment(rest))
         _run(COMMANDS[command])
     except ValueError as error:
         sys.stderr.write(f"error: {error}\n")
@@ -59,6 +63,14 @@ def _run(place: str) -> None:
         import runpy
 
         runpy.run_module(module_name, run_name="__main__")
+
+
+def _environment(arguments: Sequence[str]) -> str:
+    """What ``--env`` names, "" where it is not there."""
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        if argument == "--env" or argument.startswith("--env="):
+            return following if argument == "--env" else argument.removeprefix("--env=")
+    return ""
 
 
 def complete(command: str, arguments: Sequence[str]) -> list[str]:

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.presets import nearest
 from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
+from sb3_cpm.zoo.registration import register_robotics
 
 
 class Built(NamedTuple):
@@ -207,12 +208,7 @@ def ensure_registered(env_id: str) -> None:
 
     :raises ValueError: if gymnasium does not know it, with the nearest name
     """
-    if env_id not in gym.registry and env_id.startswith(("PointMaze", "AntMaze", "Fetch")):
-        try:
-            import gymnasium_robotics
-        except ImportError as error:
-            raise ValueError(f"{env_id} needs a package that is missing: pip install gymnasium-robotics") from error
-        gym.register_envs(gymnasium_robotics)
+    register_robotics(env_id)
     if env_id not in gym.registry:
         raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
 
