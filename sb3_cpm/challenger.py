@@ -540,7 +540,10 @@ class Challenger:
         config = content["config"]
         name = config["uncertainty_class"]
         if uncertainty_class is None and name not in UNCERTAINTY_CLASSES:
-            raise ValueError(f"{path} was saved with the uncertainty class {name}: pass it as `uncertainty_class`.")
+            raise ValueError(
+                f"{path} was saved with the uncertainty class {name}, and a file cannot hold a class: "
+                f"Challenger.load({str(path)!r}, uncertainty_class={name}) loads it, also for `start_from`."
+            )
         challenger = cls(
             spaces.Dict({key: _space(entry) for key, entry in config["keys"].items()}),
             spaces.Box(np.float32(config["action"]["low"]), np.float32(config["action"]["high"])),
