@@ -42,10 +42,12 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Imported when asked for: ``doctor`` and ``--help`` have to work where torch does not."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
-    return globals()[name]
+    if name in _HOMES:
+        globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+        return globals()[name]
+    if f"sb3_cpm.{name}" in _HOMES.values():  # `import sb3_cpm; sb3_cpm.buffers`
+        return importlib.import_module(f"sb3_cpm.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -64,6 +64,12 @@ def test_without_maniskill_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> 
     assert not findings["SAPIEN renders"].well and "sb3_cpm[maniskill]" in findings["SAPIEN renders"].cure
 
 
+def test_submodules_are_attributes() -> None:
+    code = "import sb3_cpm; print(sb3_cpm.buffers.CPMBuffer is sb3_cpm.CPMBuffer, hasattr(sb3_cpm, 'nonsense'))"
+    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    assert child.stdout.strip() == "True False", child.stderr
+
+
 def test_the_package_imports_without_maniskill() -> None:
     """With ManiSkill and SAPIEN forbidden everything works but making an environment, which says what it needs."""
     code = """

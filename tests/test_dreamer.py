@@ -722,6 +722,12 @@ def test_images_that_vec_normalize_would_move_out_of_their_range(space, kwargs, 
         make(env, policy="MultiInputPolicy" if space is MIXED else "CnnPolicy")
 
 
+def test_images_that_vec_normalize_declares_anew():
+    """It does so for uint8 from 0 to 255, in float32: 3.3 is no such number."""
+    camera = spaces.Box(0, 255, (3, 16, 16), np.uint8)
+    make(VecNormalize(DummyVecEnv([lambda: Sampling(camera)]), clip_obs=3.3), policy="CnnPolicy")
+
+
 # ---- bad input -----------------------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -44,7 +45,7 @@ class Mortal(gym.Wrapper):
         self.marker = how
 
     def start_next_from(self, place: float) -> None:
-        self.next_start = place
+        self.next_start = float(place)
 
     def look(self) -> Any:
         return self.observation
@@ -183,7 +184,7 @@ def test_a_start_that_was_asked_for_survives_its_worker() -> None:
     for _ in range(3):
         env.step(ACTIONS)
     assert env.get_attr("started_from", 0) == [None]
-    assert lost(lambda: env.env_method("start_next_from", 8.0, indices=[0])) == [8.0]  # dies of the question
+    lost(lambda: env.env_method("start_next_from", 8.0, indices=[0]))  # noticed by the question
     env.step(ACTIONS)
     assert env.get_attr("started_from", 0) == [8.0]
     for _ in range(3):
@@ -195,7 +196,43 @@ def test_a_start_that_was_asked_for_survives_its_worker() -> None:
     assert env.get_attr("started_from", 0) == [9.0]
     env.env_method("start_next_from", 10.0, indices=[0])
     assert lost(env.reset) == [10.0]
+    for _ in range(3):
+        env.step(ACTIONS)
+    # the agent may also begin anew instead of being told
+    lost(lambda: env.env_method("start_next_from", 11.0, indices=[0]))
+    env.reset()
+    assert env.get_attr("started_from", 0) == [11.0]
+    env.env_method("start_next_from", 12.0, indices=[0])
+    lost(lambda: env.get_attr("limit"))
+    env.reset()
+    assert env.get_attr("started_from", 0) == [12.0]
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore:Worker 0 died")
+def test_a_wrong_start_is_forgotten() -> None:
+    """Its worker dies of it; the next one must not."""
+    env = robust([make])
+    env.seed(3)
+    env.reset()
+    with pytest.raises(RuntimeError, match="died, too, when it was asked for 'env_method'"):
+        env.env_method("start_next_from", "nowhere")
+    assert env.step(ACTIONS[:1])[2].all()
+    env.env_method("start_next_from", 2.0)
+    env.reset()
+    assert env.get_attr("started_from") == [2.0]
+    env.close()
+
+
+def test_what_cannot_be_sent_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_cpm.envs.robust.CLOSING", 60.0)
+    env = robust([make])
+    env.reset()
+    with pytest.raises((AttributeError, pickle.PicklingError), match="pickle"):
+        env.set_attr("limit", lambda: 3)
+    begin = time.monotonic()
+    env.close()
+    assert time.monotonic() - begin < 30
 
 
 def test_a_worker_that_hangs() -> None:

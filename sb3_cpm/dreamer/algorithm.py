@@ -148,10 +148,11 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if env is None or not env.norm_obs:
             return
         keys = list(spec.keys) if env.norm_obs_keys is None else env.norm_obs_keys  # None: the observation is a Box
+        clip = float(np.float32(env.clip_obs))  # as a space declares it
         moved = {
             key: f"{low:g} to {high:g}"
             for key, (low, high) in spec.ranges.items()
-            if key in keys and not low <= -env.clip_obs < env.clip_obs <= high
+            if key in keys and not low <= -clip < clip <= high
         }
         if moved:
             others = [key for key in keys if key not in moved]

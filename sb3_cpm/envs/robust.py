@@ -137,20 +137,18 @@ class _Worker:
     def send(self, message: tuple[str, Any]) -> None:
         self._asked = message
         command, data = message
-        if command == "set_attr":
-            self._attributes[data[0]] = data[1]
-        if command == "reset" and data[0] is not None:
-            self._seed = data[0]
-        if command == "reset":
-            self._untold = None
-        if command == "env_method" and data[0] == "start_next_from":
-            self._next_start = data
         if command == "step" and self._untold is not None:
             return
-        self._owes_answer = True
         # if it is dead, `recv` sees to that, when the other workers have their message, too
         with contextlib.suppress(OSError):
             self.remote.send(message)
+            self._owes_answer = True
+        # not before: what cannot be pickled was never asked
+        if command == "set_attr":
+            self._attributes[data[0]] = data[1]
+        if command == "reset":
+            self._seed = self._seed if data[0] is None else data[0]
+            self._untold = None
 
     def recv(self) -> Any:
         command, data = self._asked
@@ -161,7 +159,9 @@ class _Worker:
                 answer = self._receive(self.timeout)
             except (EOFError, OSError) as error:
                 answer = self._recover(command, data, error)
-        if command == "reset":
+        if command == "env_method" and data[0] == "start_next_from":
+            self._next_start = data
+        elif command == "reset":
             self._last_observation = answer[0]
             self._next_start = None
         elif command == "step":
@@ -217,15 +217,18 @@ class _Worker:
         warnings.warn(f"Worker {self.index} {reason}: a new one takes its place, its episode is truncated.", stacklevel=2)
         if command == "reset":
             return self._replace(*data)
-        is_start = command == "env_method" and data is self._next_start
+        start = self._next_start
+        if command != "step":
+            self._next_start = None
         observation, info = self._replace()
         lost = {"TimeLimit.truncated": True, "terminal_observation": self._last_observation, "worker_died": reason}
         answer = observation, 0.0, True, lost, info
         if command == "step":
             return answer
         self._untold = answer
-        if is_start:  # the new episode has begun there; asked once more, the next one would, too
-            return None
+        if start is not None:  # kept for the episode that the agent gets to see: it may call `reset` instead of `step`
+            self._call("env_method", start)
+            self._next_start = start
         return self._call(command, data)
 
     def _tell(self) -> tuple[Any, ...]:
@@ -234,9 +237,11 @@ class _Worker:
         answer, self._untold = self._untold, None
         if self._next_start is None:
             return answer
-        # asked for after the death: meant for the episode that begins now, as the agent sees it
-        observation, info = self._call("reset", (None, {}))
-        self._next_start = None
+        # Meant for the episode that begins now, as the agent sees it. In a new process: there are environments that refuse to
+        # be reset in the middle of an episode.
+        self.process.kill()
+        self.process.join()
+        observation, info = self._replace()
         return observation, *answer[1:4], info
 
     def _episode_ended(self, answer: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -268,11 +273,10 @@ class _Worker:
             own = np.random.SeedSequence([self._seed or 0, self.index, self._generations])
             # without a seed for the old one, SB3 seeds NumPy's generator
             seed = int(np.random.randint(2**31)) if self._seed is None else int(own.generate_state(1)[0] >> 1)
-        if self._next_start is not None:
-            self._call("env_method", self._next_start)
-        observation, info = self._call("reset", (seed, options))
-        self._next_start = None
-        return observation, info
+        start, self._next_start = self._next_start, None
+        if start is not None:
+            self._call("env_method", start)
+        return self._call("reset", (seed, options))
 
     def _start(self) -> None:
         self.remote.close()
@@ -287,8 +291,8 @@ class _Worker:
 
     def _call(self, command: str, data: Any) -> Any:
         try:
-            self._owes_answer = True
             self.remote.send((command, data))
+            self._owes_answer = True
             return self._receive(self.timeout)
         except (EOFError, OSError) as error:
             raise RuntimeError(

@@ -99,7 +99,10 @@ class ChallengerRestorer(BaseCallback):
     def __init__(self, checkpoint: Path, callbacks: list[BaseCallback]) -> None:
         super().__init__()
         self.checkpoint, self.callbacks = checkpoint, callbacks
-        self.next_training: dict[int, int] = load_extra(checkpoint)["next_training"]
+        extra = load_extra(checkpoint)
+        if "next_training" not in extra:
+            raise ValueError(f"{checkpoint} was written by an earlier sb3_cpm: finish the run with that, or remove its folder.")
+        self.next_training: dict[int, int] = extra["next_training"]
 
     def _on_training_start(self) -> None:
         for index, step in self.next_training.items():
