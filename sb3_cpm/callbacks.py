@@ -7,13 +7,16 @@ environment, through which ``learn()`` takes its steps.
 
 import signal
 import threading
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
@@ -148,20 +151,17 @@ class ChallengerCallback(BaseCallback):
         _check_learning_starts(model)  # type: ignore[arg-type]
         if self.challenger is None:
             self.challenger = self._make_challenger()
-        elif (self.challenger.observation_space, self.challenger.action_space) != (
-            model.observation_space,
-            model.action_space,
-        ):
+        elif (self.challenger.observation_space, self.challenger.action_space) != (_original_space(model), model.action_space):
             raise ValueError(
                 "This callback's challenger belongs to other spaces than the model's: it has "
                 f"{self.challenger.observation_space} and {self.challenger.action_space}, the model "
-                f"{model.observation_space} and {model.action_space}. Make a new ChallengerCallback."
+                f"{_original_space(model)} and {model.action_space}. Make a new ChallengerCallback."
             )
 
     def _make_challenger(self) -> Challenger:
-        assert isinstance(self.model.observation_space, spaces.Dict) and isinstance(self.model.action_space, spaces.Box)
+        assert isinstance(self.model.action_space, spaces.Box)
         challenger = Challenger(
-            self.model.observation_space,
+            _original_space(self.model),
             self.model.action_space,
             device=self.model.device if self.device == "auto" else self.device,
             preset=self.preset,
@@ -199,6 +199,13 @@ class ChallengerCallback(BaseCallback):
         self._learn_started = model.start_time
         buffer.has_challenger = self._is_running
         buffer.stopwatch = self.stopwatch
+        if not buffer.challenge_ratio and (model.replay_buffer_kwargs or {}).get("challenge_ratio", 1):
+            warnings.warn(
+                "The replay buffer has challenge_ratio=0, as one that Dreamer has filled: the player will be given no "
+                "challenges. Set model.replay_buffer.challenge_ratio (the default is 0.25), or make the model with "
+                "replay_buffer_kwargs=dict(challenge_ratio=0).",
+                stacklevel=2,
+            )
         # what came before learning_starts, and what an earlier learn() left, is no backlog
         self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
         self._listen_for_ctrl_c()
@@ -410,6 +417,24 @@ def _check_model(model: Any) -> None:
         )
 
 
+def _original_space(model: BaseAlgorithm) -> spaces.Dict:
+    """
+    What the environment gives, which is what C reads: where VecNormalize also normalizes images, it declares them anew, in
+    SB3's own space (uint8 from 0 to 255 only; a CPMBuffer then stores them as float32).
+    """
+    space, env = model.observation_space, model.get_vec_normalize_env()
+    assert isinstance(space, spaces.Dict)
+    if env is None or not env.norm_obs:
+        return space
+    given: Any = env.get_original_obs()
+    images = {
+        key: spaces.Box(0, 255, space[key].shape, np.float32)
+        for key in env.norm_obs_keys or ()
+        if given[key].dtype == np.uint8 and space[key].dtype != np.uint8
+    }
+    return spaces.Dict({**space.spaces, **images}) if images else space
+
+
 def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
     """P can only sample once an episode has ended; say so now instead of in the middle of the run."""
     assert model.env is not None and isinstance(model.replay_buffer, CPMBuffer)
@@ -417,10 +442,11 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
     if longest is None or model.replay_buffer.episodes_ended:
         return
     needed = longest * model.n_envs
-    if model.learning_starts < needed:
+    if model.learning_starts - model.num_timesteps < needed:
         raise ValueError(
             f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps "
-            f"in each of {model.n_envs} environments. Set learning_starts={needed} or more."
+            f"in each of {model.n_envs} environments. Set learning_starts={model.num_timesteps + needed} or more"
+            + (", or go on with the buffer that load_replay_buffer() loads." if model.num_timesteps else ".")
         )
     if model.buffer_size < 2 * needed:
         raise ValueError(

@@ -493,8 +493,8 @@ class Challenger:
         theirs, ours = content["config"]["keys"], self._config()["keys"]
         if not _same_observations(theirs, ours):
             raise ValueError(
-                f"{path} was saved for the observations {theirs}, this challenger reads {ours}. (An image with neither range nor "
-                "dtype is uint8 from 0 to 255.)"
+                f"{path} was saved for the observations {theirs}, this challenger reads {ours}. (An image with neither "
+                "range nor dtype is uint8 from 0 to 255.)"
             )
         self.load_state_dict(content["state"], restore_rng)
         saved = content["config"]["preset"]

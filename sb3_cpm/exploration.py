@@ -55,12 +55,19 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
         raise ValueError(f"A decay needs 0 <= floor <= start <= 1, got start={start}, floor={floor}")
     if not rate > 0:
         raise ValueError(f"rate must be positive, got {rate}")
-    shape = _DECAYS[decay]
+    return _Decay(decay, start, floor, rate)
 
-    def epsilon(progress_remaining: float) -> float:
-        return floor + (start - floor) * shape(1.0 - progress_remaining, rate)
 
-    return epsilon
+class _Decay(NamedTuple):
+    """A decay by name; can be pickled, as SB3's callbacks can."""
+
+    name: str
+    start: float
+    floor: float
+    rate: float
+
+    def __call__(self, progress_remaining: float) -> float:
+        return self.floor + (self.start - self.floor) * _DECAYS[self.name](1.0 - progress_remaining, self.rate)
 
 
 class _Row(NamedTuple):

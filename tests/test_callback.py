@@ -1,6 +1,7 @@
 """The whole method through stock SB3: two lines of user code, save and load, seeds, several environments, bad input."""
 
 import os
+import pickle
 import signal
 
 import gymnasium as gym
@@ -88,6 +89,45 @@ def test_images_vectors_and_both(keys):
         expected = tuple(key for key in ("pointcloud", "state") if key in keys)
         assert set(model.replay_buffer.player_keys) == set(expected), "no camera image is moved for P"
     assert model.replay_buffer.counters.proposed > 0
+
+
+def test_images_that_vec_normalize_declares_anew():
+    """C reads what the environment gives: the whole range of uint8 from black to white."""
+    env = VecNormalize(toy(("camera", "state")), norm_obs_keys=["camera", "state"])
+    model = make_model(env, policy=PointNetPolicy)
+    callback = make_callback()
+    model.learn(200, callback=callback)
+    assert callback.challenger.trained_updates and callback.challenger.spec.ranges == {"camera": (0.0, 255.0)}
+    batch = model.replay_buffer.sample_sequences(2, 4, ("camera", "state"))
+    images = callback.challenger.spec.preprocess(batch.observations, th.device("cpu"))
+    assert float(images.images.max()) > 0.0, "bright discs"
+
+
+def test_going_on_without_the_buffer(tmp_path):
+    """learning_starts counts from the run's beginning: said before training."""
+    model = make_model(toy())
+    model.learn(150, callback=make_callback())
+    model.save(tmp_path / "model")
+    resumed = SAC.load(tmp_path / "model", env=toy())
+    with pytest.raises(ValueError, match="Set learning_starts=200 or more, or go on with the buffer"):
+        resumed.learn(100, callback=make_callback(), reset_num_timesteps=False)
+    resumed.learning_starts = 200
+    resumed.learn(100, callback=make_callback(), reset_num_timesteps=False)
+
+
+def test_a_buffer_without_challenges_is_mentioned():
+    """As Dreamer leaves it, which has no player."""
+    model = make_model(toy())
+    model.replay_buffer.challenge_ratio = 0
+    with pytest.warns(UserWarning, match="has challenge_ratio=0.* will be given no challenges"):
+        model.learn(10, callback=make_callback())
+
+
+@pytest.mark.parametrize("decay", ["exponential", "linear"])
+def test_a_callback_can_be_pickled(decay):
+    callback = ChallengerCallback(decay=decay)
+    again = pickle.loads(pickle.dumps(callback))
+    assert [again.decay(left) for left in (1.0, 0.5, 0.0)] == [callback.decay(left) for left in (1.0, 0.5, 0.0)]
 
 
 class FlatCopy(gym.ObservationWrapper):

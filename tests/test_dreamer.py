@@ -728,6 +728,24 @@ def test_images_that_vec_normalize_declares_anew():
     make(VecNormalize(DummyVecEnv([lambda: Sampling(camera)]), clip_obs=3.3), policy="CnnPolicy")
 
 
+def test_it_learns_from_what_a_player_and_its_challenger_collected(tmp_path):
+    """There is nobody to give challenges to."""
+    player = SAC(
+        "MultiInputPolicy",
+        toy(),
+        replay_buffer_class=CPMBuffer,
+        learning_starts=60,
+        policy_kwargs={"net_arch": [8]},
+        device="cpu",
+    )
+    player.learn(100, callback=ChallengerCallback(preset=TINY))
+    player.save_replay_buffer(tmp_path / "buffer")
+    model = make()
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(80)
+    assert model.replay_buffer.challenge_ratio == 0 and model.replay_buffer.size() == 180
+
+
 # ---- bad input -----------------------------------------------------------------------------------------------------------
 
 

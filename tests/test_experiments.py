@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -648,6 +649,7 @@ def test_the_legend_has_every_agent_once():
         for step in (0, 9)
     ]
     figure = DRAWINGS["curves"](EXPERIMENTS["pickcube-state"], Data({"evaluations": pd.DataFrame(rows)}, []))
+    plt.close(figure)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["SAC (1 to 2 seeds)", "CPM-SAC (1 seed)"]
 
 
@@ -660,6 +662,7 @@ def draw_lines(experiment):
         for step in (0, 9)
     ]
     figure = DRAWINGS["curves"](experiment, Data({"evaluations": pd.DataFrame(rows)}, []))
+    plt.close(figure)
     return [line.get_color() for line in figure.axes[0].lines]
 
 

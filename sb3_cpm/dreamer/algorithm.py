@@ -362,6 +362,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if truncate_last_traj:
             buffer.truncate_last_trajectory()
         buffer.device = self.device
+        if isinstance(buffer, CPMBuffer):
+            buffer.challenge_ratio = 0.0  # challenges are for a player
         self.replay_buffer = buffer
 
 

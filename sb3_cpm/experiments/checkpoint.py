@@ -101,7 +101,7 @@ class ChallengerRestorer(BaseCallback):
         self.checkpoint, self.callbacks = checkpoint, callbacks
         extra = load_extra(checkpoint)
         if "next_training" not in extra:
-            raise ValueError(f"{checkpoint} was written by an earlier sb3_cpm: finish the run with that, or remove the folder.")
+            raise ValueError(f"{checkpoint} was written by an earlier sb3_cpm: finish the run with that, or delete it.")
         self.next_training: dict[int, int] = extra["next_training"]
 
     def _on_training_start(self) -> None:
