@@ -7,6 +7,7 @@ schedule convention: a function of the remaining progress, which falls from 1 to
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -58,7 +59,8 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
     return _Decay(decay, start, floor, rate)
 
 
-class _Decay(NamedTuple):
+@dataclass(frozen=True)
+class _Decay:
     """A decay by name; can be pickled, as SB3's callbacks can."""
 
     name: str
