@@ -20,7 +20,7 @@ from sb3_cpm.experiments.player_losses import log_player_losses
 from sb3_cpm.experiments.specification import RunSpec
 from sb3_cpm.experiments.tables import DIAGNOSTICS, EVALUATIONS, TRAINING, DiagnosticsWriter, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.run.settings import check_seed
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
@@ -59,11 +59,7 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     """
     folder = spec.folder(results)
     agent = load_agent(spec.config, spec.env_id, spec.overrides)
-    if not 0 <= spec.seed < FIRST_SEED - agent.n_envs:
-        raise ValueError(
-            f"seed={spec.seed}: expected 0 or more, and less than {FIRST_SEED - agent.n_envs}: the evaluation's episodes have "
-            "the seeds from there on, and training never sees these"
-        )
+    check_seed(spec.seed, agent.n_envs)
     config = run_folder.description(spec, agent)
     note = run_folder.check_belongs(folder, config)
     if run_folder.is_finished(folder):

@@ -22,6 +22,15 @@ TASK_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
+def check_seed(seed: int, n_envs: int) -> None:
+    """:raises ValueError: for a seed of a run some of whose environments would have seeds of the evaluation"""
+    if not 0 <= seed < FIRST_SEED - n_envs:
+        raise ValueError(
+            f"seed={seed}: expected 0 or more, and less than {FIRST_SEED - n_envs}: the evaluation's episodes have the seeds "
+            "from there on, and training never sees these"
+        )
+
+
 @dataclass(frozen=True)
 class TrainSettings:
     """
@@ -101,11 +110,7 @@ class TrainSettings:
         for name in ("n_envs", "batch_size", "train_freq", "challenger_train_freq", "threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected 1 or more")
-        if not 0 <= self.seed < FIRST_SEED - self.n_envs:
-            raise ValueError(
-                f"seed={self.seed}: expected 0 or more, and less than {FIRST_SEED - self.n_envs}: the "
-                "evaluation's episodes have the seeds from there on, and training never sees these"
-            )
+        check_seed(self.seed, self.n_envs)
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps={self.steps}: expected 1 or more")
         if self.evaluations < 0 or (self.evaluations and self.eval_episodes < 1):

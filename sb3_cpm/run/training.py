@@ -250,7 +250,7 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
     """
     learning_starts = settings.learning_starts
     if learning_starts is None:
-        episode = (max_episode_steps(env) or 200) * settings.n_envs  # the challenger needs a whole one
+        episode = _episode_steps(env)  # the challenger needs a whole one
         learning_starts = max(min(4 * episode, (settings.steps or 0) // 2), episode)
     kwargs: dict[str, Any] = {
         "buffer_size": settings.buffer_size,
@@ -278,10 +278,15 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
     return algorithm(policy, env, **kwargs)
 
 
+def _episode_steps(env: VecEnv) -> int:
+    """Steps of all environments together until each has ended an episode, 200 each where nobody knows."""
+    return (max_episode_steps(env) or 200) * env.num_envs
+
+
 def _check_length(settings: TrainSettings, model: OffPolicyAlgorithm) -> None:
     """A run that ends before the first update would look finished."""
     if (settings.steps or 0) <= model.learning_starts:
-        episode = (max_episode_steps(model.env) or 200) * settings.n_envs  # type: ignore[arg-type]
+        episode = _episode_steps(model.env)  # type: ignore[arg-type]
         raise ValueError(
             f"steps={settings.steps} is no longer than learning_starts={model.learning_starts}, the steps before the first "
             f"update: nothing would be learned. Set steps above {model.learning_starts}"
