@@ -1,5 +1,6 @@
 """The challenger on a GPU: what it computes there is what it computes on a CPU, with and without its switches for speed."""
 
+import gc
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, weights
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty import Plan2Explore, Transitions
+from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 CATEGORICAL = {"latent": "categorical", "stoch_size": 4, "stoch_classes": 5}
@@ -108,6 +110,34 @@ def test_what_cannot_be_recorded_goes_on_without_a_cuda_graph() -> None:
         challenger.train(batches[0])
     for batch in batches[1:]:
         assert all(np.isfinite(value) for value in challenger.train(batch).values())
+
+
+def test_a_graph_that_is_thrown_away_does_not_spoil_one_being_recorded() -> None:
+    """Python may throw away an earlier challenger at any moment, if cycles hold it; here it is during a recording."""
+    pool = GraphPool(torch.device("cuda", torch.cuda.current_device()))
+    inputs = torch.ones(3, device="cuda")
+
+    def twice(numbers: torch.Tensor) -> torch.Tensor:
+        _ = [[] for _ in range(100_000)]  # type: ignore[var-annotated]
+        return 2.0 * numbers
+
+    thresholds = gc.get_threshold()
+    try:
+        gc.disable()
+        old: Any = Graphed("old", twice, pool)
+        for _ in range(3):
+            old(inputs)
+        old.itself = old
+        del old
+        new = Graphed("new", twice, pool)
+        for _ in range(2):
+            new(inputs)
+        gc.set_threshold(2_000, 1, 1)
+        gc.enable()
+        assert new(inputs).tolist() == [2.0, 2.0, 2.0] and gc.isenabled()
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.enable()
 
 
 def test_not_a_number_is_refused_in_a_cuda_graph_too() -> None:

@@ -6,6 +6,7 @@ compute them. A CUDA graph launches all of them at once. It replays what was rec
 functions that are given tensors of the same shapes, look at no number on the way, and read weights that change in place.
 """
 
+import gc
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -55,6 +56,19 @@ def forbidden_synchronization() -> Iterator[None]:
         yield
     finally:
         torch.cuda.set_sync_debug_mode(before)
+
+
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Context in which nothing that is thrown away gives memory back: an older graph that does spoils one being recorded."""
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class Graphed:
@@ -115,6 +129,6 @@ class Graphed:
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.device(self.pool.device):
             stream = torch.cuda.Stream()  # torch's own stream for recording belongs to the GPU that was the first to use it
-            with torch.cuda.graph(graph, pool=self.pool.handle, stream=stream):
+            with no_garbage_collection(), torch.cuda.graph(graph, pool=self.pool.handle, stream=stream):
                 outputs = self.function(*fixed)
         return Recording(graph, fixed, outputs)
