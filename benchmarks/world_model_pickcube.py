@@ -5,6 +5,9 @@ How well the world model learns PickCube-v1 from its images: errors on held-out 
 
     OMP_NUM_THREADS=1 python benchmarks/world_model_pickcube.py                         # preset "default", 3 seeds, 10 minutes
     OMP_NUM_THREADS=1 python benchmarks/world_model_pickcube.py --preset report --seeds 0 --updates 400
+    OMP_NUM_THREADS=1 python benchmarks/world_model_pickcube.py --recorded episodes.npz     # records them the first time only
+
+On a machine with a GPU it trains there, with CUDA graphs; with ``--recorded`` that machine needs no simulator.
 
 Records episodes of the simulator with two cameras of 32 x 32 and the state vector: a third random actions, a third the
 scripted grasp, a third that with noise, so that rewards vary. Trains the world model only, and writes to ``--folder``
@@ -23,7 +26,7 @@ import argparse
 import csv
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -32,13 +35,15 @@ from gymnasium import spaces
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.envs import ManiSkillEnv, make_maniskill_env
-from sb3_cpm.envs.scripted import PickCubeController
 from sb3_cpm.run.plots import BLUE, GREY, ORANGE, STYLE, save_figure
 from sb3_cpm.type_aliases import SequenceBatch
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+
+if TYPE_CHECKING:
+    from sb3_cpm.envs import ManiSkillEnv
+    from sb3_cpm.envs.scripted import PickCubeController
 
 CAMERAS = ("base_camera", "hand_camera")
 STEPS = 50
@@ -74,9 +79,9 @@ class Recorded(NamedTuple):
 
 
 # ---------------------------------------------------------------------- episodes
-def record(env: ManiSkillEnv, seed: int, rng: np.random.Generator) -> Recorded:
+def record(env: "ManiSkillEnv", controller: "PickCubeController", seed: int, rng: np.random.Generator) -> Recorded:
     """One episode of the kind that its seed says, in turns."""
-    controller, kind = PickCubeController(env), KINDS[seed % len(KINDS)]
+    kind = KINDS[seed % len(KINDS)]
     seen, actions, rewards = [env.reset(seed=seed)[0]], [], []
     for _ in range(STEPS):
         action = np.asarray(env.action_space.sample() if kind == "random" else controller.act())
@@ -88,6 +93,39 @@ def record(env: ManiSkillEnv, seed: int, rng: np.random.Generator) -> Recorded:
         rewards.append(reward)
     observations = {key: np.stack([one[key] for one in seen]) for key in seen[0]}
     return Recorded(observations, np.stack(actions), np.array(rewards, np.float32))
+
+
+def record_all(n_training: int, n_held_out: int) -> tuple[list[Recorded], list[Recorded]]:
+    """Episodes to learn from, and held-out ones."""
+    from sb3_cpm.envs import make_maniskill_env
+    from sb3_cpm.envs.scripted import PickCubeController
+
+    env = make_maniskill_env("PickCube-v1", n_points=0, goal_points=0, ignore_terminations=True)
+    env.action_space.seed(0)
+    rng = np.random.default_rng(0)
+    seeds = [*range(n_training), *range(1_000_000, 1_000_000 + n_held_out)]
+    recorded = [record(env, PickCubeController(env), seed, rng) for seed in seeds]
+    env.close()
+    return recorded[:n_training], recorded[n_training:]
+
+
+def save_recorded(path: Path, episodes: list[Recorded]) -> None:
+    """What the world model sees of episodes, as arrays of shape ``(n_episodes, ...)``."""
+    arrays = {key: np.stack([one.observations[key] for one in episodes]) for key in (*CAMERAS, "state")}
+    others = {name: np.stack([getattr(one, name) for one in episodes]) for name in ("actions", "rewards")}
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays, **others)
+
+
+def load_recorded(path: Path) -> list[Recorded]:
+    """What :func:`save_recorded` wrote."""
+    with np.load(path) as file:
+        arrays = {key: file[key] for key in file.files}
+    keys = (*CAMERAS, "state")
+    return [
+        Recorded({key: arrays[key][i] for key in keys}, arrays["actions"][i], arrays["rewards"][i])
+        for i in range(len(arrays["rewards"]))
+    ]
 
 
 def fill(buffer: CPMBuffer, episode: Recorded) -> None:
@@ -176,10 +214,11 @@ def train(buffer: CPMBuffer, judge: Judge, preset: str, seed: int, updates: int)
     """
     np.random.seed(seed)
     torch.manual_seed(seed)
-    world_model_only: dict[str, Any] = {"train_exploration_behavior": False, "train_task_behavior": False}
+    options: dict[str, Any] = {"train_exploration_behavior": False, "train_task_behavior": False}
+    options["compile"] = torch.cuda.is_available()
     space, action_space = buffer.observation_space, buffer.action_space
     assert isinstance(space, spaces.Dict) and isinstance(action_space, spaces.Box)
-    challenger = Challenger(space, action_space, "auto", preset, [*CAMERAS, "state"], **world_model_only)
+    challenger = Challenger(space, action_space, "auto", preset, [*CAMERAS, "state"], **options)
     marks = {factor * 10**power for factor in (1, 2, 5) for power in range(1, 6)} | {0, updates}
     rows, spent = [], 0.0
     for update in range(updates + 1):
@@ -262,20 +301,30 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=3000)
     parser.add_argument("--episodes", type=int, default=150, help="to learn from")
     parser.add_argument("--held-out", type=int, default=18)
+    parser.add_argument("--recorded", type=Path, help="file of the episodes, which is made if it is not there")
     parser.add_argument("--folder", type=Path, default=Path("results/world_model"))
     options = parser.parse_args()
     torch.set_num_threads(1)
 
-    env = make_maniskill_env("PickCube-v1", n_points=0, goal_points=0, ignore_terminations=True)
-    env.action_space.seed(0)
-    rng = np.random.default_rng(0)
-    training = [record(env, seed, rng) for seed in range(options.episodes)]
-    held_out = [record(env, 1_000_000 + seed, rng) for seed in range(options.held_out)]
-    assert isinstance(env.observation_space, spaces.Dict)
-    buffer = CPMBuffer(STEPS * (options.episodes + 1), env.observation_space, env.action_space, challenge_ratio=0.0)
+    if options.recorded is None or not options.recorded.exists():
+        training, held_out = record_all(options.episodes, options.held_out)
+        if options.recorded is not None:
+            save_recorded(options.recorded, [*training, *held_out])
+    else:
+        episodes = load_recorded(options.recorded)
+        if len(episodes) != options.episodes + options.held_out:
+            parser.error(
+                f"{options.recorded} holds {len(episodes)} episodes, not {options.episodes} to learn from and "
+                f"{options.held_out} held-out ones: give these numbers, or remove it to record it anew."
+            )
+        training, held_out = episodes[: options.episodes], episodes[options.episodes :]
+    images = {key: spaces.Box(0, 255, training[0].observations[key].shape[1:], np.uint8) for key in CAMERAS}
+    state = spaces.Box(-np.inf, np.inf, training[0].observations["state"].shape[1:])
+    actions = spaces.Box(-1.0, 1.0, training[0].actions.shape[1:])
+    space = spaces.Dict({**images, "state": state})
+    buffer = CPMBuffer(STEPS * (options.episodes + 1), space, actions, challenge_ratio=0.0)
     for episode in training:
-        fill(buffer, episode)
-    env.close()
+        fill(buffer, Recorded({key: episode.observations[key] for key in space}, episode.actions, episode.rewards))
 
     options.folder.mkdir(parents=True, exist_ok=True)
     judge = Judge(held_out, training)

@@ -398,7 +398,8 @@ def test_disagreement_and_its_gradient() -> None:
     assert disagreement([one.view(3, 50, 4) for one in heads]).shape == (3, 50)
 
 
-def test_ensemble_loss_is_per_head() -> None:
-    heads, target = leaves(*[(6, 4)] * 3, dtype=torch.float64), torch.randn(6, 4, dtype=torch.float64)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # by hand and, as on a GPU, with PyTorch's operation
+def test_ensemble_loss_is_per_head(dtype: torch.dtype) -> None:
+    heads, target = leaves(*[(6, 4)] * 3, dtype=dtype), torch.randn(6, 4, dtype=dtype)
     expected = 0.5 * (torch.stack(heads) - target).square().sum((0, 2)).mean()
     assert torch.allclose(ensemble_loss(heads, target), expected)
