@@ -11,7 +11,8 @@ Every run writes ``results/dreamer/AGENT/ENV/seedN.csv`` when it is complete; co
 the same ten episodes (seeds from 1,000,000 on) deterministically. ``plot`` draws ``results/dreamer/learning.png`` and writes
 ``results/dreamer/summary.csv``, means over seeds with 95% confidence intervals. sheeprl is run by
 ``peers/sheeprl_learning.py`` in an interpreter of its own, with the same sizes, environment steps and updates. Its latents are
-categorical; ``dreamer_categorical`` is ours with latents of the same kind and size.
+categorical; ``dreamer_categorical`` is ours with latents of the same kind and size. Agents that end in ``_stopped`` are ours
+without a gradient through the actor's input, as in sheeprl.
 """
 
 import argparse
@@ -38,8 +39,16 @@ EPISODES = 10
 LEARNING_STARTS = 1000
 NAMES = {
     "dreamer": "sb3_cpm Dreamer",
+    "dreamer_stopped": "sb3_cpm Dreamer, no gradient through the actor's input",
     "dreamer_categorical": "sb3_cpm Dreamer, categorical latents",
+    "dreamer_categorical_stopped": "sb3_cpm Dreamer, categorical, no gradient through the actor's input",
     "sheeprl": "sheeprl dreamer_v2",
+}
+PRESETS: dict[str, Any] = {
+    "dreamer": "default",
+    "dreamer_stopped": {"actor_input_gradient": False},
+    "dreamer_categorical": {"latent": "categorical"},
+    "dreamer_categorical_stopped": {"latent": "categorical", "actor_input_gradient": False},
 }
 TASKS: dict[str, dict[str, Any]] = {
     "pendulum": dict(id="Pendulum-v1", steps=8000, every=1000, train_freq=5, pretrain=0, last_rate=1e-4, solved=-200),
@@ -62,7 +71,7 @@ def run_dreamer(agent: str, env: str, seed: int, path: Path) -> None:
     model = Dreamer(
         policy, make_env(env, seed=seed), LinearSchedule(1e-3, task["last_rate"], 1.0), learning_starts=LEARNING_STARTS,
         train_freq=task["train_freq"], pretrain_steps=task["pretrain"], seed=seed, device="cpu",
-        preset={"latent": "categorical"} if agent == "dreamer_categorical" else "default",
+        preset=PRESETS[agent],
     )  # fmt: skip
 
     def record(step: int, returns: list[float], lengths: list[int]) -> None:

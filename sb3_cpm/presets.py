@@ -59,6 +59,7 @@ REPORT: dict[str, Any] = {
     "lambda_": 0.95,  # of the lambda-returns
     "actor_gradient": "dynamics",  # how actors learn: "dynamics", "reinforce" or "both"
     "reinforce_share": 0.9,  # share of REINFORCE in "both"
+    "actor_input_gradient": True,  # whether returns also reach the actor through the latents that later actions depend on
     "entropy_scale": 1e-4,  # reward for the actor's entropy
     "actor_layers": 4,  # hidden layers
     "actor_units": 400,  # size of each of them

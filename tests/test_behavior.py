@@ -166,6 +166,26 @@ def test_starts_that_count_for_nothing_have_no_influence(kind: str) -> None:
     assert not torch.isclose(alike.critic, different.critic)
 
 
+@pytest.mark.parametrize(("horizon", "same"), [(1, True), (3, False)])
+def test_the_gradient_through_the_actors_input(horizon: int, same: bool) -> None:
+    """Concerns the actions after the first alone, and changes what the actor learns but not what it imagines."""
+    challenger = small(horizon=horizon, entropy_scale=0.0)
+    found = []
+    for through in (True, False):
+        challenger.exploration.preset = {**challenger.exploration.preset, "actor_input_gradient": through}
+        torch.manual_seed(0)
+        start = imagine(challenger)
+        found.append(
+            challenger.exploration.losses(
+                challenger.world_model, start, lambda imagined: imagined.next_feats.sum(-1), challenger.optimizers
+            )
+        )
+    exact, stopped = found
+    assert torch.equal(exact.actor, stopped.actor)
+    close = [torch.allclose(*pair, atol=1e-6) for pair in zip(exact.actor_gradients, stopped.actor_gradients, strict=True)]
+    assert all(close) is same
+
+
 @pytest.mark.parametrize("kind", ["reinforce", "both"])
 def test_save_load_train_is_train(kind: str, tmp_path: Any) -> None:
     challenger, batch = small(actor_gradient=kind, train_task_behavior=True), random_batch(VECTOR, 2)

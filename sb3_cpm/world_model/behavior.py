@@ -133,15 +133,16 @@ class ActorCritic(nn.Module):
         """
         Let the actor act in the world model for ``horizon`` steps.
 
-        The actor reads latents that carry a gradient, so that returns have their exact one, also through the choice of later
-        actions. The code of Dreamer V1, V2 and sheeprl stops it at the actor's input; the two have not been compared.
+        With ``actor_input_gradient`` the actor reads latents that carry a gradient, so that returns have their exact one,
+        also through the choice of later actions. Without, it stops there, as in the code of Dreamer V1, V2 and sheeprl.
 
         :param world_model: supplies the dynamics; its weights get no gradient
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """
         states, feats, actions, policies = [start], [start.feat], [], []
         for _ in range(self.preset["horizon"]):
-            policies.append(self.actor(feats[-1]))
+            seen = feats[-1] if self.preset["actor_input_gradient"] else feats[-1].detach()
+            policies.append(self.actor(seen))
             actions.append(policies[-1].rsample())
             states.append(world_model.rssm.imagine_step(states[-1], actions[-1]))
             feats.append(states[-1].feat)
