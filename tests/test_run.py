@@ -11,12 +11,14 @@ import pytest
 import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer
+from sb3_cpm.envs import DictObservation
 from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run import environment as environments
 from sb3_cpm.run.environment import make_env
@@ -233,6 +235,15 @@ def test_the_greatest_seed_is_none_of_the_evaluation() -> None:
 def test_a_short_run_learns_from_its_middle_on(steps: int, expected: int) -> None:
     settings = TrainSettings(env="CPMToy-v0", steps=steps, device="cpu").resolved()
     assert make_model(settings, environments.make_vec_env("CPMToy-v0", 1, 0)).learning_starts == expected
+
+
+@pytest.mark.parametrize("steps, n_envs, expected", [(1500, 1, 1500), (600, 1, 1000), (2500, 3, 3000), (30_000, 1, 20_000)])
+def test_a_buffer_of_the_run_s_choice_is_never_refused(steps: int, n_envs: int, expected: int) -> None:
+    settings = TrainSettings(env="CPMToy-v0", steps=steps, n_envs=n_envs, device="cpu").resolved()
+    env = environments.make_vec_env("CPMToy-v0", 1, 0)
+    assert make_model(settings, env).replay_buffer.buffer_size == expected  # type: ignore[union-attr]
+    long = make_vec_env("Pendulum-v1", 1, env_kwargs={"max_episode_steps": 30_000}, wrapper_class=DictObservation)
+    assert make_model(settings, long).replay_buffer.buffer_size == 60_000  # type: ignore[union-attr]
 
 
 def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:

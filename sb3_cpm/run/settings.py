@@ -47,7 +47,8 @@ class TrainSettings:
     :param decay: how the exploration probability falls, see :func:`~sb3_cpm.exploration.make_decay`
     :param unit: who acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
     :param challenge_ratio: share of the player's batches that come from challenges
-    :param buffer_size: transitions that D holds; None: all of the run, 20000 at most
+    :param buffer_size: transitions that D holds; None: all of the run, 20000 at most, or two episodes of each environment if
+        that is more
     :param batch_size: of the player
     :param learning_rate: of the player
     :param gamma: discount factor of the player; None: the task's own, else 0.99
@@ -131,7 +132,6 @@ class TrainSettings:
             gamma=0.99 if settings.gamma is None else settings.gamma,
             tau=0.005 if settings.tau is None else settings.tau,
             ent_coef="auto_0.05" if settings.ent_coef is None else settings.ent_coef,
-            buffer_size=settings.buffer_size or min(max(steps, 1000 * settings.n_envs), 20_000),
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -248,12 +248,14 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
     :param settings: of the run
     :param env: the training environments
     """
-    learning_starts = settings.learning_starts
+    steps, episode = settings.steps or 0, _episode_steps(env)
+    learning_starts, buffer_size = settings.learning_starts, settings.buffer_size
     if learning_starts is None:
-        episode = _episode_steps(env)  # the challenger needs a whole one
-        learning_starts = max(min(4 * episode, (settings.steps or 0) // 2), episode)
+        learning_starts = max(min(4 * episode, steps // 2), episode)  # the challenger needs a whole one
+    if buffer_size is None:
+        buffer_size = max(min(max(steps, 1000 * settings.n_envs), 20_000), 2 * episode)  # less is refused
     kwargs: dict[str, Any] = {
-        "buffer_size": settings.buffer_size,
+        "buffer_size": buffer_size,
         "batch_size": settings.batch_size,
         "learning_rate": settings.learning_rate,
         "gamma": settings.gamma,
