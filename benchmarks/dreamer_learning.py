@@ -12,7 +12,7 @@ the same ten episodes (seeds from 1,000,000 on) deterministically. ``plot`` draw
 ``results/dreamer/summary.csv``, means over seeds with 95% confidence intervals. sheeprl is run by
 ``peers/sheeprl_learning.py`` in an interpreter of its own, with the same sizes, environment steps and updates. Its latents are
 categorical; ``dreamer_categorical`` is ours with latents of the same kind and size. Agents that end in ``_stopped`` are ours
-without a gradient through the actor's input, as in sheeprl.
+whose gradient stops at the actor's input, as sheeprl's does.
 """
 
 import argparse
@@ -39,9 +39,9 @@ EPISODES = 10
 LEARNING_STARTS = 1000
 NAMES = {
     "dreamer": "sb3_cpm Dreamer",
-    "dreamer_stopped": "sb3_cpm Dreamer, no gradient through the actor's input",
-    "dreamer_categorical": "sb3_cpm Dreamer, categorical latents",
-    "dreamer_categorical_stopped": "sb3_cpm Dreamer, categorical, no gradient through the actor's input",
+    "dreamer_stopped": "sb3_cpm Dreamer, gradient stopped",
+    "dreamer_categorical": "sb3_cpm Dreamer, categorical",
+    "dreamer_categorical_stopped": "sb3_cpm Dreamer, categorical, gradient stopped",
     "sheeprl": "sheeprl dreamer_v2",
 }
 PRESETS: dict[str, Any] = {

@@ -160,7 +160,7 @@ def draw(
     :param names: agents and how the legend calls them
     :param lines: by environment, a value to mark
     """
-    figure, axes = plt.subplots(1, len(envs), figsize=(4.6 * len(envs), 3.4), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(1, len(envs), figsize=(4.6 * len(envs), 4.0), squeeze=False, layout="constrained")
     for axis, env in zip(axes[0], envs, strict=True):
         low, high = np.inf, -np.inf
         for index, (agent, name) in enumerate(names.items()):
@@ -180,9 +180,9 @@ def draw(
         if lines and env in lines:
             axis.axhline(lines[env], color="grey", linestyle=":", linewidth=1)
         axis.set(title=env, xlabel="environment steps", ylabel=label)
-        axis.set_ylim(low - 0.08 * (high - low), high + 0.3 * (high - low))  # the legend's place is at the top
+        axis.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low))
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=8, frameon=False, loc="upper left")
+        axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.2))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
     plt.close(figure)
