@@ -24,7 +24,7 @@ from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.uncertainty.ensemble import Ensemble
 from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imagination
-from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, read_file, write_file
+from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, check_storable, read_file, write_file
 from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.observations import Inputs, ObservationSpec, check_action_space, to_tensor
@@ -49,7 +49,7 @@ class Challenger:
         :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
     :param uncertainty_kwargs: arguments for it, on top of the preset's
     :param overrides: single preset entries
-    :raises ValueError: for spaces it cannot work with and unknown preset entries
+    :raises ValueError: for spaces it cannot work with, unknown preset entries, and arguments that no file can hold
     """
 
     def __init__(
@@ -77,6 +77,7 @@ class Challenger:
         self.world_model = WorldModel(self.spec, self.action_dim, self.preset).to(self.device)
         self.uncertainty_name, kind, defaults = self._uncertainty_class(uncertainty_class)
         self.uncertainty_kwargs: dict[str, Any] = plain({**defaults, **(uncertainty_kwargs or {})})
+        check_storable("uncertainty_kwargs", self.uncertainty_kwargs)
         model = self.world_model
         sizes = LatentSizes(
             model.feat_dim, self.action_dim, model.latent.size, model.rssm.deter_size, model.embed_dim, model.latent.one_hot

@@ -15,6 +15,7 @@ from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions
 from sb3_cpm.uncertainty.base import LatentSizes, Uncertainty
 from sb3_cpm.uncertainty.parts import RunningNorm
+from sb3_cpm.world_model.checkpoint import read_file
 
 SIZES = LatentSizes(feat=8, action=2, stoch=3, deter=5, embed=6)
 CATEGORICAL = {**SMALL, "latent": "categorical", "stoch_size": 4, "stoch_classes": 5}
@@ -124,6 +125,27 @@ def test_each_trains_saves_and_loads_bit_identically(name: str, kwargs: dict, pr
     observations = {key: value[:4, 0] for key, value in batch.observations.items()}
     opinions = [one.evaluate(observations, batch.actions[1:4, 0]).disagreement for one in (challenger, loaded)]
     assert np.array_equal(*opinions) and (opinions[0] >= 0.0).all()
+
+
+class Weighted(UNCERTAINTY_CLASSES["plan2explore"]):  # type: ignore[misc]
+    """With an argument of any type."""
+
+    def __init__(self, sizes: LatentSizes, weights: Any = None, **kwargs: Any) -> None:
+        super().__init__(sizes, **kwargs)
+
+
+@pytest.mark.parametrize("weights", [torch.ones(3), [1.0, np.float32(2)], {"a": (None, "b")}], ids=["tensor", "list", "dict"])
+def test_arguments_that_a_file_can_hold(weights: Any, tmp_path: Path) -> None:
+    challenger = small(VECTOR, uncertainty_class=Weighted, uncertainty_kwargs={"weights": weights})
+    challenger.save(tmp_path / "challenger.pt")
+    assert read_file(tmp_path / "challenger.pt", torch.device("cpu"))["config"]["uncertainty_kwargs"].keys() >= {"weights"}
+
+
+@pytest.mark.parametrize("weights", [np.ones(3), [np.ones(3)], len, lambda: 1], ids=["array", "arrays", "function", "lambda"])
+def test_arguments_that_no_file_can_hold_are_refused(weights: Any) -> None:
+    """Not when the file is read again, which is too late."""
+    with pytest.raises(ValueError, match=r"uncertainty_kwargs\['weights'\] is of <class '.*'>, which cannot be read"):
+        small(VECTOR, uncertainty_class=Weighted, uncertainty_kwargs={"weights": weights})
 
 
 @every_class

@@ -1,5 +1,6 @@
 """One file per challenger: replaced only by a complete one, read without executing anything in it."""
 
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -48,6 +49,25 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     if content.get("version") != FILE_VERSION:
         raise ValueError(f"{path} has file version {content.get('version')}, this package reads {FILE_VERSION}.")
     return content
+
+
+def check_storable(name: str, values: Mapping[str, Any]) -> None:
+    """
+    :param name: how the user calls them
+    :param values: by name
+    :raises ValueError: for one that could be written to a file but not read from it, which allows plain types and tensors only
+    """
+    for key, value in values.items():
+        file = io.BytesIO()
+        try:
+            torch.save(value, file)
+            file.seek(0)
+            torch.load(file, weights_only=True)
+        except Exception as error:  # picklers raise what they like
+            raise ValueError(
+                f"{name}[{key!r}] is of {type(value)}, which cannot be read from a saved challenger. Give numbers, strings, "
+                "tensors (torch.as_tensor(array)), or lists, tuples and dicts of them."
+            ) from error
 
 
 def check_finite(path: str | os.PathLike, name: str, weights: Mapping[str, Any]) -> None:
