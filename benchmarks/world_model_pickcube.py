@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from sb3_cpm.envs.scripted import PickCubeController
 
 CAMERAS = ("base_camera", "hand_camera")
+KEYS = (*CAMERAS, "state")
 STEPS = 50
 CONTEXT = 5
 KINDS = ("random", "scripted", "noisy")
@@ -92,12 +93,12 @@ def record(env: "ManiSkillEnv", controller: "PickCubeController", seed: int, rng
         seen.append(observation)
         actions.append(action)
         rewards.append(reward)
-    observations = {key: np.stack([one[key] for one in seen]) for key in seen[0]}
+    observations = {key: np.stack([one[key] for one in seen]) for key in KEYS}
     return Recorded(observations, np.stack(actions), np.array(rewards, np.float32))
 
 
-def record_all(n_training: int, n_held_out: int) -> tuple[list[Recorded], list[Recorded]]:
-    """Episodes to learn from, and held-out ones."""
+def record_all(n_training: int, n_held_out: int) -> list[Recorded]:
+    """Episodes to learn from, then held-out ones."""
     from sb3_cpm.envs import make_maniskill_env
     from sb3_cpm.envs.scripted import PickCubeController
 
@@ -107,12 +108,12 @@ def record_all(n_training: int, n_held_out: int) -> tuple[list[Recorded], list[R
     seeds = [*range(n_training), *range(1_000_000, 1_000_000 + n_held_out)]
     recorded = [record(env, PickCubeController(env), seed, rng) for seed in seeds]
     env.close()
-    return recorded[:n_training], recorded[n_training:]
+    return recorded
 
 
 def save_recorded(path: Path, episodes: list[Recorded]) -> None:
-    """What the world model sees of episodes, as arrays of shape ``(n_episodes, ...)``."""
-    arrays = {key: np.stack([one.observations[key] for one in episodes]) for key in (*CAMERAS, "state")}
+    """As arrays of shape ``(n_episodes, ...)``."""
+    arrays = {key: np.stack([one.observations[key] for one in episodes]) for key in KEYS}
     others = {name: np.stack([getattr(one, name) for one in episodes]) for name in ("actions", "rewards")}
     with atomic(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays, **others)
@@ -122,9 +123,8 @@ def load_recorded(path: Path) -> list[Recorded]:
     """What :func:`save_recorded` wrote."""
     with np.load(path) as file:
         arrays = {key: file[key] for key in file.files}
-    keys = (*CAMERAS, "state")
     return [
-        Recorded({key: arrays[key][i] for key in keys}, arrays["actions"][i], arrays["rewards"][i])
+        Recorded({key: arrays[key][i] for key in KEYS}, arrays["actions"][i], arrays["rewards"][i])
         for i in range(len(arrays["rewards"]))
     ]
 
@@ -219,7 +219,7 @@ def train(buffer: CPMBuffer, judge: Judge, preset: str, seed: int, updates: int)
     options["compile"] = torch.cuda.is_available()
     space, action_space = buffer.observation_space, buffer.action_space
     assert isinstance(space, spaces.Dict) and isinstance(action_space, spaces.Box)
-    challenger = Challenger(space, action_space, "auto", preset, [*CAMERAS, "state"], **options)
+    challenger = Challenger(space, action_space, "auto", preset, KEYS, **options)
     marks = {factor * 10**power for factor in (1, 2, 5) for power in range(1, 6)} | {0, updates}
     rows, spent = [], 0.0
     for update in range(updates + 1):
@@ -307,25 +307,25 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
 
-    if options.recorded is None or not options.recorded.exists():
-        training, held_out = record_all(options.episodes, options.held_out)
-        if options.recorded is not None:
-            save_recorded(options.recorded, [*training, *held_out])
-    else:
+    if options.recorded is not None and options.recorded.exists():
         episodes = load_recorded(options.recorded)
         if len(episodes) != options.episodes + options.held_out:
             parser.error(
                 f"{options.recorded} holds {len(episodes)} episodes, not {options.episodes} to learn from and "
                 f"{options.held_out} held-out ones: give these numbers, or remove it to record it anew."
             )
-        training, held_out = episodes[: options.episodes], episodes[options.episodes :]
+    else:
+        episodes = record_all(options.episodes, options.held_out)
+        if options.recorded is not None:
+            save_recorded(options.recorded, episodes)
+    training, held_out = episodes[: options.episodes], episodes[options.episodes :]
     images = {key: spaces.Box(0, 255, training[0].observations[key].shape[1:], np.uint8) for key in CAMERAS}
     state = spaces.Box(-np.inf, np.inf, training[0].observations["state"].shape[1:])
     actions = spaces.Box(-1.0, 1.0, training[0].actions.shape[1:])
     space = spaces.Dict({**images, "state": state})
     buffer = CPMBuffer(STEPS * (options.episodes + 1), space, actions, challenge_ratio=0.0)
     for episode in training:
-        fill(buffer, Recorded({key: episode.observations[key] for key in space}, episode.actions, episode.rewards))
+        fill(buffer, episode)
 
     options.folder.mkdir(parents=True, exist_ok=True)
     judge = Judge(held_out, training)
