@@ -11,11 +11,11 @@ from torch import nn
 
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
-from sb3_cpm.world_model import acceleration, activation, deconvolution, one_hot
+from sb3_cpm.world_model import acceleration, activation, one_hot
 from sb3_cpm.world_model import linear as linear_module
 from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.activation import ELU, elu_
-from sb3_cpm.world_model.deconvolution import Drawing
+from sb3_cpm.world_model.deconvolution import Deconvolution
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
 from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
 from sb3_cpm.world_model.losses import squared_error
@@ -59,8 +59,19 @@ def test_products_are_those_of_pytorch(batch: tuple[int, ...], small_products: N
     inputs = leaves((*batch, 30), (20, 30), (20,))
     assert is_faster(inputs[0], 20)
     assert_equal(gradients(linear, inputs), gradients(F.linear, inputs), 1e-5)
-    flat = [inputs[0].detach().flatten(0, -2).requires_grad_(True), *leaves((30, 20), (20,))]
-    assert_equal(gradients(affine, flat), gradients(lambda x, w, b: x @ w + b, flat), 1e-5)
+
+
+@pytest.mark.parametrize("onednn", [True, False])
+def test_products_without_gradients(onednn: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear_module, "prefers_onednn", lambda: onednn and linear_module.onednn_works())
+    x, matrix, bias, total = torch.randn(70, 30), torch.randn(30, 20), torch.randn(20), torch.randn(70, 20)
+    expected, out = x @ matrix, torch.empty(70, 20)
+    assert_equal([affine(x, matrix, bias)], [expected + bias], 1e-5)
+    assert linear_module.multiply(x, matrix.t(), out=out) is out
+    assert_equal([linear_module.multiply(x, matrix.t()), out], [expected, expected], 1e-5)
+    expected = expected + total
+    linear_module.add_product_(total, x, matrix.t())
+    assert_equal([total], [expected], 1e-5)
 
 
 def test_a_gradient_without_strides(small_products: None) -> None:
@@ -283,21 +294,37 @@ def test_elu_of_extreme_values_and_of_what_is_left_to_pytorch(fast_exp: None) ->
 # ---- deconvolution ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("channels, height, width", [(3, 4, 4), (6, 5, 3), (1, 1, 1)])
-def test_drawing_is_a_transposed_convolution(channels: int, height: int, width: int) -> None:
+@pytest.mark.parametrize("channels, height, width", [(3, 4, 4), (6, 5, 3), (1, 1, 1), (24, 5, 3)])
+def test_the_decoders_layers_are_transposed_convolutions(channels: int, height: int, width: int) -> None:
     inputs = leaves((7, 8, height, width), (8, channels, 4, 4), (channels,))
 
     def with_layer(layer: nn.ConvTranspose2d) -> Callable[..., torch.Tensor]:
         # contiguous: random weights of the result are drawn in the order of its memory
         return lambda x, weight, bias: torch.func.functional_call(layer, {"weight": weight, "bias": bias}, x).contiguous()
 
-    assert deconvolution.is_faster(inputs[0], channels)
-    found = gradients(with_layer(Drawing(8, channels)), inputs)
-    assert_equal(found, gradients(with_layer(nn.ConvTranspose2d(8, channels, 4, 2, 1)), inputs), 1e-5)
-    assert Drawing(8, channels)(inputs[0]).is_contiguous(memory_format=torch.channels_last)
-    assert not deconvolution.is_faster(inputs[0].double(), channels) and not deconvolution.is_faster(inputs[0], 64)
+    ours, theirs = Deconvolution(8, channels), nn.ConvTranspose2d(8, channels, 4, 2, 1)
+    assert_equal(gradients(with_layer(ours), inputs), gradients(with_layer(theirs), inputs), 1e-5)
+    plain = ours(inputs[0].contiguous(memory_format=torch.channels_last))
+    assert plain.is_contiguous(memory_format=torch.channels_last) and plain.grad_fn.name() == "_DeconvolutionBackward"
+    F.elu_(plain)  # as the layer that follows does
+    wide = ours.double()(inputs[0].double())
+    assert torch.allclose(plain.double(), F.elu(wide), atol=1e-5) and wide.grad_fn.name() == "ConvolutionBackward0"
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert Drawing(8, channels)(inputs[0]).dtype == torch.bfloat16
+        assert Deconvolution(8, channels)(inputs[0]).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("needed", [(True, False, False), (False, True, False), (False, False, True), (False, True, True)])
+def test_a_transposed_convolution_computes_the_gradients_that_are_asked_for(needed: tuple[bool, ...]) -> None:
+    inputs = leaves((7, 8, 5, 3), (8, 24, 4, 4), (24,))
+    some = [one.detach().requires_grad_(wanted) for one, wanted in zip(inputs, needed, strict=True)]
+    layer = Deconvolution(8, 24)
+
+    def sums(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(layer, {"weight": weight, "bias": bias}, x).square().sum()
+
+    wanted = [one for one, asked in zip(some, needed, strict=True) if asked]
+    expected = [one for one, asked in zip(torch.autograd.grad(sums(*inputs), inputs), needed, strict=True) if asked]
+    assert_equal(torch.autograd.grad(sums(*some), wanted), expected, 1e-5)
 
 
 # ---- one-hot inputs --------------------------------------------------------------------------------------------------
@@ -363,26 +390,32 @@ def test_a_challenger_learns_the_same_from_one_hot_samples(small_products: None,
 # ---- ensemble --------------------------------------------------------------------------------------------------------
 
 
-def test_heads_one_by_one_are_the_heads_at_once(small_products: None) -> None:
-    ensemble, (inputs,) = Ensemble(3, 5, 2, layers=2, units=7), leaves((70, 5))
-    weights = [inputs, *ensemble.parameters()]
-    results = []
-    for outputs in (torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)):
-        torch.manual_seed(4)
-        results.append([outputs, *torch.autograd.grad((outputs * torch.randn_like(outputs)).sum(), weights)])
-    assert_equal(*results, 1e-4)
+@pytest.mark.parametrize("onednn", [True, False])
+@pytest.mark.parametrize("one_hot", [None, OneHot(3, 4)])
+def test_heads_one_by_one_are_the_heads_at_once(
+    one_hot: OneHot | None, onednn: bool, small_products: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear_module, "prefers_onednn", lambda: onednn and linear_module.onednn_works())
+    inputs = torch.randn(300, 14) if one_hot is None else samples(300, one_hot, 2)
+    inputs.requires_grad_(True)
+    assert (find_choice(inputs, one_hot, 7) is None) == (one_hot is None)
+    ensemble = Ensemble(3, 14, 2, layers=2, units=7, one_hot=one_hot)
+    weights = list(ensemble.parameters())
+    for wanted in ([inputs, *weights], [inputs], weights):
+        inputs.requires_grad_(wanted != weights)
+        with frozen(*[ensemble] if wanted == [inputs] else []):
+            found = torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)
+        results = []
+        for outputs in found:
+            torch.manual_seed(4)
+            results.append([outputs, *torch.autograd.grad((outputs * torch.randn_like(outputs)).sum(), wanted)])
+        assert_equal(*results, 1e-4)
 
 
-def test_heads_with_one_hot_inputs(small_products: None) -> None:
-    kind = OneHot(3, 4)
-    ensemble, inputs = Ensemble(3, 14, 2, layers=2, units=7, one_hot=kind), samples(300, kind, 2).requires_grad_(True)
-    assert find_choice(inputs, kind, 7) is not None
-    weights = [inputs, *ensemble.parameters()]
-    results = []
-    for outputs in (torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)):
-        torch.manual_seed(4)
-        results.append([outputs, *torch.autograd.grad((outputs * torch.randn_like(outputs)).sum(), weights)])
-    assert_equal(*results, 1e-4)
+def test_heads_of_which_only_some_have_a_loss(small_products: None) -> None:
+    ensemble, inputs = Ensemble(3, 5, 2, layers=2, units=7), torch.randn(70, 5)
+    found = torch.autograd.grad(ensemble.predictions(inputs)[1].sum(), list(ensemble.parameters()))
+    assert_equal(list(found), list(torch.autograd.grad(ensemble(inputs)[1].sum(), list(ensemble.parameters()))), 1e-4)
 
 
 def test_disagreement_and_its_gradient() -> None:

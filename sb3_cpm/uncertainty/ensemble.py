@@ -12,10 +12,10 @@ from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
 from sb3_cpm.world_model.acceleration import cache_slices, is_plain
-from sb3_cpm.world_model.activation import elu_
-from sb3_cpm.world_model.linear import affine, is_large
+from sb3_cpm.world_model.activation import elu_, elu_gradient_
+from sb3_cpm.world_model.linear import add_product_, affine, is_large, multiply
 from sb3_cpm.world_model.losses import squared_error
-from sb3_cpm.world_model.one_hot import OneHot, find_choice, one_hot_affine
+from sb3_cpm.world_model.one_hot import Choice, OneHot, find_choice
 
 
 class Ensemble(nn.Module):
@@ -62,23 +62,63 @@ class Ensemble(nn.Module):
         """The same as a sequence of the heads' outputs, each of shape ``(n, output_dim)``, without copying them together."""
         return self._one_by_one(inputs) if is_large(inputs, self.biases[0].shape[-1]) else self(inputs).unbind(0)
 
-    def _one_by_one(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+    def _one_by_one(self, inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """On CPUs: a head's layers fit into the cache."""
-        outputs = []
-        last = len(self.weights) - 1
-        weights, biases = ([part.unbind(0) for part in parts] for parts in (self.weights, self.biases))
         choice = find_choice(inputs, self.one_hot, self.biases[0].shape[-1])  # one for all heads
-        for head in range(self.heads):
-            hidden = inputs
+        return _Heads.apply(inputs, choice, *self.weights, *self.biases)
+
+
+class _Heads(torch.autograd.Function):
+    """
+    One head after the other, with gradients by hand: all heads' weights are one parameter, whose gradient is written head by
+    head. Composed of PyTorch's operations it would be copied together, and those for the inputs added up one by one.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, inputs: torch.Tensor, choice: Choice | None, *parameters: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        layers = len(parameters) // 2
+        weights, biases = parameters[:layers], parameters[layers:]
+        hidden, outputs = [], []
+        for head in range(len(weights[0])):
+            output = inputs
             for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
                 if layer == 0 and choice is not None:
-                    hidden = one_hot_affine(hidden, choice, weight[head], bias[head][0])
+                    output = choice.affine(inputs, weight[head], bias[head, 0])
                 else:
-                    hidden = affine(hidden, weight[head], bias[head][0])
-                if layer < last:
-                    hidden = elu_(hidden)
-            outputs.append(hidden)
-        return outputs
+                    output = affine(output, weight[head], bias[head, 0])
+                if layer < layers - 1:
+                    hidden.append(elu_(output))
+            outputs.append(output)
+        ctx.choice = choice
+        ctx.save_for_backward(inputs, *weights, *hidden)
+        return tuple(outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        inputs_learn, _, weights_learn, *others = ctx.needs_input_grad
+        layers = (1 + len(others)) // 2
+        inputs, *saved = ctx.saved_tensors
+        weights, hidden = saved[:layers], saved[layers:]
+        to_inputs = torch.zeros_like(inputs) if inputs_learn else None
+        to_weights = [torch.empty_like(weight) if weights_learn else None for weight in weights]
+        to_biases = [weight.new_empty(len(weight), 1, weight.shape[-1]) if weights_learn else None for weight in weights]
+        for head, gradient in enumerate(gradients):
+            gradient = gradient.contiguous()  # the gradient of a sum has no strides
+            values = [inputs, *hidden[head * (layers - 1) : (head + 1) * (layers - 1)]]
+            for layer in reversed(range(layers)):
+                to_weight, to_bias = to_weights[layer], to_biases[layer]
+                if to_weight is not None and to_bias is not None:
+                    torch.sum(gradient, 0, out=to_bias[head, 0])
+                    if layer == 0 and ctx.choice is not None:
+                        ctx.choice.write_gradient(inputs, gradient, to_weight[head])
+                    else:
+                        multiply(values[layer].t(), gradient.t(), out=to_weight[head])
+                if layer > 0:
+                    gradient = elu_gradient_(multiply(gradient, weights[layer][head]), values[layer])
+                elif to_inputs is not None:
+                    add_product_(to_inputs, gradient, weights[0][head])
+        return to_inputs, None, *to_weights, *to_biases
 
 
 def disagreement(predictions: Sequence[torch.Tensor] | torch.Tensor) -> torch.Tensor:

@@ -37,6 +37,15 @@ def elu_(values: torch.Tensor) -> torch.Tensor:
     return _ELU.apply(values)
 
 
+def elu_gradient_(gradient: torch.Tensor, result: torch.Tensor) -> torch.Tensor:
+    """
+    :param gradient: of ELU's result; overwritten
+    :param result: of ELU
+    :return: that of what went in, the same tensor
+    """
+    return torch.ops.aten.elu_backward.grad_input(gradient, 1.0, 1.0, 1.0, True, result, grad_input=gradient)
+
+
 def is_faster(values: torch.Tensor) -> bool:
     """Whether values are many, lie in memory without gaps, and are plain, on a processor where it has been measured."""
     return (

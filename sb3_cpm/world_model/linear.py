@@ -43,22 +43,8 @@ def linear(inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
     """
     if not is_faster(inputs, len(weight)):
         return F.linear(inputs, weight, bias)
-    flat = _Product.apply(inputs.reshape(-1, inputs.shape[-1]), weight, bias, False)
+    flat = _Product.apply(inputs.reshape(-1, inputs.shape[-1]), weight, bias)
     return flat.view(*inputs.shape[:-1], len(weight))
-
-
-def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-    """
-    The same with the matrix the other way round, ``inputs @ matrix + bias``.
-
-    :param inputs: shape ``(n, size_in)``
-    :param matrix: shape ``(size_in, size_out)``
-    :param bias: shape ``(size_out,)``
-    :return: shape ``(n, size_out)``
-    """
-    if not is_faster(inputs, matrix.shape[-1]):
-        return torch.addmm(bias, inputs, matrix)
-    return _Product.apply(inputs, matrix.t(), bias, True)
 
 
 def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
@@ -91,9 +77,30 @@ def onednn_works() -> bool:
     return all(torch.allclose(one, F.linear(left, right, bias), atol=1e-4) for one in found)
 
 
-def multiply(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """``left @ right.T`` of large matrices on a CPU, by the faster of both; no gradients."""
-    return _multiply(left, right) if prefers_onednn() else left @ right.t()
+def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    """
+    ``inputs @ matrix + bias`` of large matrices on a CPU, by the faster of both; no gradients.
+
+    :param inputs: shape ``(n, size_in)``
+    :param matrix: shape ``(size_in, size_out)``
+    :param bias: shape ``(size_out,)``
+    """
+    return _multiply(inputs, matrix.t(), bias) if prefers_onednn() else torch.addmm(bias, inputs, matrix)
+
+
+def multiply(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+    """``left @ right.T`` of large matrices on a CPU, by the faster of both, into ``out`` where given; no gradients."""
+    if not prefers_onednn():
+        return torch.mm(left, right.t(), out=out)
+    return _multiply(left, right) if out is None else out.copy_(_multiply(left, right))
+
+
+def add_product_(total: torch.Tensor, left: torch.Tensor, right: torch.Tensor) -> None:
+    """Add ``left @ right.T`` to ``total``; as :func:`multiply`."""
+    if prefers_onednn():
+        total.add_(_multiply(left, right))
+    else:
+        total.addmm_(left, right.t())
 
 
 def _multiply(left: torch.Tensor, right: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
@@ -102,14 +109,11 @@ def _multiply(left: torch.Tensor, right: torch.Tensor, bias: torch.Tensor | None
 
 
 class _Product(torch.autograd.Function):
-    """:func:`linear` of matrices; ``flipped``: the weights lie in memory the other way round, and so shall their gradient."""
+    """:func:`linear` of matrices."""
 
     @staticmethod
-    def forward(
-        ctx: Any, inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None, flipped: bool
-    ) -> torch.Tensor:
+    def forward(ctx: Any, inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         ctx.save_for_backward(inputs, weight)
-        ctx.flipped = flipped
         return _multiply(inputs, weight, bias)
 
     @staticmethod
@@ -121,11 +125,10 @@ class _Product(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             to_inputs = _multiply(gradient, weight.t())
         if ctx.needs_input_grad[1]:
-            one, other = gradient.t(), inputs.t()
-            to_weight = _multiply(other, one).t() if ctx.flipped else _multiply(one, other)
+            to_weight = _multiply(gradient.t(), inputs.t())
         if ctx.needs_input_grad[2]:
             to_bias = gradient.sum(0)
-        return to_inputs, to_weight, to_bias, None
+        return to_inputs, to_weight, to_bias
 
 
 @contextmanager

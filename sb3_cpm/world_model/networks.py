@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from sb3_cpm.world_model.activation import ELU
-from sb3_cpm.world_model.deconvolution import Drawing
+from sb3_cpm.world_model.deconvolution import Deconvolution
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
 from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear
@@ -164,8 +164,8 @@ class ConvDecoder(nn.Module):
         self.linear = OneHotLinear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2], one_hot)
         modules: list[nn.Module] = []
         for wide, narrow in pairwise(widths):
-            modules += [nn.ConvTranspose2d(wide, narrow, kernel_size=4, stride=2, padding=1), ELU()]
-        self.convolutions = channels_last(nn.Sequential(*modules, Drawing(widths[-1], channels)))
+            modules += [Deconvolution(wide, narrow), ELU()]
+        self.convolutions = channels_last(nn.Sequential(*modules, Deconvolution(widths[-1], channels)))
         self.largest = depth * height * width // 4
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:

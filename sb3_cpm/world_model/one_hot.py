@@ -65,15 +65,27 @@ class Choice:
         counts = torch.bincount(self.columns.flatten(), minlength=self.size)
         return torch.from_numpy(order.ravel()), counts.cumsum(0) - counts
 
-    def distribute(self, gradient: torch.Tensor, to_matrix: torch.Tensor) -> None:
+    def affine(self, inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
         """
-        :param gradient: of the product, shape ``(n, size_out)``
-        :param to_matrix: where the matrix's gradient is written, the transposed one-hot vectors' product with it, shape
-            ``(size, size_out)``
+        ``inputs @ matrix + bias``, without gradients.
+
+        :param inputs: shape ``(n, size_in)``, of which the first are the one-hot vectors
+        :param matrix: shape ``(size_in, size_out)``
+        :param bias: shape ``(size_out,)``
+        """
+        rest = torch.addmm(bias, inputs[:, self.size :], matrix[self.size :])
+        return rest.add_(self.add_up(matrix[: self.size]))
+
+    def write_gradient(self, inputs: torch.Tensor, gradient: torch.Tensor, to_matrix: torch.Tensor) -> None:
+        """
+        :param inputs: of :meth:`affine`
+        :param gradient: of its result
+        :param to_matrix: where that of the matrix is written, ``inputs.T @ gradient``
         """
         order, starts = self.rows
-        for part, to_part in zip(gradient.split(WIDTH, dim=1), to_matrix.split(WIDTH, dim=1), strict=True):
+        for part, to_part in zip(gradient.split(WIDTH, dim=1), to_matrix[: self.size].split(WIDTH, dim=1), strict=True):
             to_part.copy_(F.embedding_bag(order, part.contiguous(), starts, mode="sum"))
+        to_matrix[self.size :] = inputs[:, self.size :].t() @ gradient
 
 
 def find_choice(inputs: torch.Tensor, one_hot: OneHot | None, size_out: int) -> Choice | None:
@@ -131,8 +143,7 @@ class _Product(torch.autograd.Function):
     def forward(ctx: Any, inputs: torch.Tensor, choice: Choice, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(inputs, matrix)
         ctx.choice = choice
-        rest = torch.addmm(bias, inputs[:, choice.size :], matrix[choice.size :])
-        return rest.add_(choice.add_up(matrix[: choice.size]))
+        return choice.affine(inputs, matrix, bias)
 
     @staticmethod
     @once_differentiable
@@ -145,8 +156,7 @@ class _Product(torch.autograd.Function):
             to_inputs = multiply(gradient, matrix)
         if ctx.needs_input_grad[2]:
             to_matrix = torch.empty_like(matrix)  # with its strides
-            choice.distribute(gradient, to_matrix[: choice.size])
-            to_matrix[choice.size :] = inputs[:, choice.size :].t() @ gradient
+            choice.write_gradient(inputs, gradient, to_matrix)
         if ctx.needs_input_grad[3]:
             to_bias = gradient.sum(0)
         return to_inputs, None, to_matrix, to_bias
