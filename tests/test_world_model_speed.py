@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from challenger_helpers import BOTH, random_batch, small
 from torch import nn
 
+from sb3_cpm.uncertainty import heads as heads_module
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
 from sb3_cpm.world_model import acceleration, activation, one_hot
@@ -416,6 +417,26 @@ def test_heads_of_which_only_some_have_a_loss(small_products: None) -> None:
     ensemble, inputs = Ensemble(3, 5, 2, layers=2, units=7), torch.randn(70, 5)
     found = torch.autograd.grad(ensemble.predictions(inputs)[1].sum(), list(ensemble.parameters()))
     assert_equal(list(found), list(torch.autograd.grad(ensemble(inputs)[1].sum(), list(ensemble.parameters()))), 1e-4)
+
+
+@pytest.mark.parametrize("onednn", [True, False])
+@pytest.mark.parametrize("one_hot", [None, OneHot(3, 4)])
+def test_heads_rate_in_slices_what_they_predict_at_once(
+    one_hot: OneHot | None, onednn: bool, small_products: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(linear_module, "prefers_onednn", lambda: onednn and linear_module.onednn_works())
+    monkeypatch.setattr(heads_module, "RATED_ROWS", 130)
+    inputs = torch.randn(300, 14) if one_hot is None else samples(300, one_hot, 2)
+    inputs.requires_grad_(True)
+    ensemble = Ensemble(3, 14, 2, layers=3, units=7, one_hot=one_hot)
+    with frozen(ensemble):
+        assert_equal(*(gradients(of, [inputs]) for of in (ensemble.disagreement, lambda x: disagreement(ensemble(x)))), 1e-4)
+        rated = ensemble.disagreement(inputs)
+    assert [one.shape for one in rated.grad_fn.saved_tensors] == [inputs.shape], "nothing else is kept"
+    with torch.no_grad():
+        assert torch.equal(ensemble.disagreement(inputs), rated)
+    learnt = torch.autograd.grad(ensemble.disagreement(inputs).sum(), list(ensemble.parameters()))
+    assert all(one.abs().sum() > 0 for one in learnt), "where weights learn they get their gradient"
 
 
 def test_disagreement_and_its_gradient() -> None:

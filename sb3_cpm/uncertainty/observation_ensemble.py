@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
+from sb3_cpm.uncertainty.ensemble import Ensemble, ensemble_loss
 from sb3_cpm.uncertainty.parts import DreamtEmbedding
 from sb3_cpm.uncertainty.scale import ScaledUncertainty
 
@@ -38,12 +38,15 @@ class ObservationEnsemble(ScaledUncertainty):
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:
         """Predicted standardised embeddings of all heads, each of shape ``(*batch, embed_dim)``."""
-        seen = self.dream(transitions.feat, transitions.embed)
-        inputs = torch.cat((seen, transitions.action), dim=-1)
+        inputs = self._inputs(transitions)
         return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
 
     def raw(self, transitions: Transitions) -> torch.Tensor:
-        return disagreement(self.predict(transitions))
+        inputs = self._inputs(transitions)
+        return self.ensemble.disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
+
+    def _inputs(self, transitions: Transitions) -> torch.Tensor:
+        return torch.cat((self.dream(transitions.feat, transitions.embed), transitions.action), dim=-1)
 
     def loss(self, transitions: Transitions) -> torch.Tensor:
         assert transitions.embed is not None and transitions.next_embed is not None, "only real transitions have embeddings"

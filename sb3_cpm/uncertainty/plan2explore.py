@@ -51,12 +51,16 @@ class Plan2Explore(ScaledUncertainty):
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:
         """Predictions of all heads, each of shape ``(*batch, target_dim)``."""
-        inputs = torch.cat((transitions.feat, transitions.action), dim=-1)
+        inputs = self._inputs(transitions)
         return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
 
     def disagreement(self, transitions: Transitions) -> torch.Tensor:
         """d: standard deviation over the heads, averaged over the target's dimensions, shape ``(*batch,)``, at least 0."""
-        return disagreement(self.predict(transitions))
+        inputs = self._inputs(transitions)
+        return self.ensemble.disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
+
+    def _inputs(self, transitions: Transitions) -> torch.Tensor:
+        return torch.cat((transitions.feat, transitions.action), dim=-1)
 
     def raw(self, transitions: Transitions) -> torch.Tensor:
         return self.disagreement(transitions)

@@ -47,6 +47,9 @@ class Choice:
     def __init__(self, columns: torch.Tensor, size: int) -> None:
         self.columns, self.size = columns, size
 
+    def __getitem__(self, rows: slice) -> "Choice":
+        return Choice(self.columns[rows], self.size)
+
     def add_up(self, matrix: torch.Tensor) -> torch.Tensor:
         """
         :param matrix: shape ``(size, size_out)``
