@@ -1,5 +1,6 @@
 """Dreamer and Plan2Explore as SB3 algorithms: acting, latent state, learning, saving, callbacks, wrappers, bad input."""
 
+import warnings
 from copy import deepcopy
 
 import gymnasium as gym
@@ -777,6 +778,22 @@ class Spaces(gym.Env):
 def test_bad_arguments(env, kwargs, message):
     with pytest.raises(ValueError, match=message):
         Dreamer(**{"policy": "MlpPolicy", "env": env(), "device": "cpu", **kwargs})
+
+
+def test_what_nobody_reads_is_told(tmp_path):
+    parts = {"vector": spaces.Box(-1, 1, (2,)), "kind": spaces.Discrete(3), "table": spaces.Box(0, 1, (4, 2), np.float32)}
+
+    def make_dreamer(**kwargs):
+        return Dreamer("MultiInputPolicy", Spaces(spaces.Dict(parts)), preset=TINY, device="cpu", buffer_size=100, **kwargs)
+
+    with pytest.warns(UserWarning, match="Dreamer reads images and vectors") as told:
+        make_dreamer().save(tmp_path / "model")
+    assert sorted(str(one.message).split("'")[1] for one in told) == ["kind", "table"]
+    assert all(one.filename == __file__ for one in told)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        make_dreamer(keys=["vector", "table"])
+        Dreamer.load(tmp_path / "model", device="cpu")
 
 
 @pytest.mark.skipif(th.cuda.is_available(), reason="there is a GPU")

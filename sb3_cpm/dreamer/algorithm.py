@@ -9,6 +9,7 @@ last observations, a row for every reset (see :class:`~sb3_cpm.type_aliases.Sequ
 import io
 import os
 import pathlib
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -35,7 +36,7 @@ from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertai
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
-from sb3_cpm.world_model.observations import check_action_space
+from sb3_cpm.world_model.observations import check_action_space, is_3d
 
 
 class DreamerAlgorithm(OffPolicyAlgorithm):
@@ -119,6 +120,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self._random_state: RandomState | None = None
         if _init_setup_model:
             self._setup_model()
+            if policy_kwargs["keys"] is None:
+                self._warn_of_unread_keys()
             if source is not None:
                 self.challenger.adopt(source)
 
@@ -137,6 +140,16 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self.policy_kwargs["device"] = str(self.device)
         super()._setup_model()
         self._check_normalized_images()
+
+    def _warn_of_unread_keys(self) -> None:
+        """Beside a player the challenger may leave things out; here nobody else reads them."""
+        for key, space in as_dict_space(self.observation_space).items():
+            if key not in self.challenger.keys and not is_3d(space):  # of images without bounds the challenger has told
+                warnings.warn(
+                    f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
+                    "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
+                    stacklevel=4,
+                )
 
     def _check_normalized_images(self) -> None:
         """
