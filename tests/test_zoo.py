@@ -528,8 +528,11 @@ def test_agents_stand_for_algorithm_and_file() -> None:
     path = str(config_folder() / "cpm_sac.yml")
     assert complete("train", ["--agent", "cpm_sac", "-n", "5"]) == ["--algo", "sac", "--conf-file", path, "-n", "5"]
     assert complete("enjoy", ["--agent", "cpm_sac"]) == ["--algo", "sac"]
+    assert complete("enjoy", ["--agent=cpm_sac", "--env=A"]) == ["--algo", "sac", "--env", "A"]
     dreamer = str(config_folder() / "dreamer.yml")
     assert complete("train", ["--algo", "dreamer"]) == ["--algo", "dreamer", "--conf-file", dreamer]
+    assert complete("train", ["--algo=dreamer"]) == ["--algo", "dreamer", "--conf-file", dreamer]
+    assert complete("train", ["--env-kwargs", "a:'b=c'"]) == ["--env-kwargs", "a:'b=c'"]
     assert complete("train", ["--algo", "dreamer", "-conf", "my.yml"]) == ["--algo", "dreamer", "-conf", "my.yml"]
     assert complete("train", ["--algo", "sac"]) == ["--algo", "sac"]
 

@@ -46,8 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from sb3_cpm.zoo.registration import register_robotics
 
     try:
-        sys.argv = [f"{sys.argv[0]} {command}", *complete(command, rest)]
-        register_robotics(_environment(rest))
+        rest = complete(command, rest)
+        sys.argv = [f"{sys.argv[0]} {command}", *rest]
+        register_robotics(_option("--env", rest))
         _run(COMMANDS[command])
     except ValueError as error:
         sys.stderr.write(f"error: {error}\n")
@@ -65,24 +66,22 @@ def _run(place: str) -> None:
         runpy.run_module(module_name, run_name="__main__")
 
 
-def _environment(arguments: Sequence[str]) -> str:
-    """What ``--env`` names, "" where it is not there."""
-    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        if argument == "--env" or argument.startswith("--env="):
-            return following if argument == "--env" else argument.removeprefix("--env=")
-    return ""
+def _option(name: str, arguments: Sequence[str]) -> str:
+    """What follows an option, "" where nothing does."""
+    places = [place for place, argument in enumerate(arguments[:-1]) if argument == name]
+    return arguments[places[0] + 1] if places else ""
 
 
 def complete(command: str, arguments: Sequence[str]) -> list[str]:
     """
     :param command: one of :data:`COMMANDS`
     :param arguments: of the command line
-    :return: the same with what rl_zoo3 needs in place of what we allow
+    :return: the same with what rl_zoo3 needs in place of what we allow, ``--option=value`` as two
     :raises ValueError: for an agent that does not exist
     """
     from sb3_cpm.zoo.agents import algorithm_of, find_config
 
-    completed = list(arguments)
+    completed = [part for argument in arguments for part in (argument.split("=", 1) if argument[:2] == "--" else [argument])]
     if "--agent" in completed:
         at = completed.index("--agent")
         if at + 1 == len(completed):
@@ -90,7 +89,7 @@ def complete(command: str, arguments: Sequence[str]) -> list[str]:
         path = find_config(completed[at + 1])
         of_agent = ["--algo", algorithm_of(path.stem)]
         completed[at : at + 2] = [*of_agent, "--conf-file", str(path)] if command == "train" else of_agent
-    algo = completed[completed.index("--algo") + 1] if "--algo" in completed[:-1] else ""
+    algo = _option("--algo", completed)
     if command == "train" and algo in ("dreamer", "plan2explore") and not {"-conf", "--conf-file"} & set(completed):
         completed += ["--conf-file", str(find_config(algo))]
     return completed
