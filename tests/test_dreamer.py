@@ -781,7 +781,8 @@ def test_bad_arguments(env, kwargs, message):
 
 
 def test_what_nobody_reads_is_told(tmp_path):
-    parts = {"vector": spaces.Box(-1, 1, (2,)), "kind": spaces.Discrete(3), "table": spaces.Box(0, 1, (4, 2), np.float32)}
+    parts = {"vector": spaces.Box(-1, 1, (2,)), "kind": spaces.Discrete(3), "table": spaces.Box(0, 9, (4, 2), np.int64)}
+    parts["cloud"] = spaces.Box(-1, 1, (5, 3))
 
     def make_dreamer(**kwargs):
         return Dreamer("MultiInputPolicy", Spaces(spaces.Dict(parts)), preset=TINY, device="cpu", buffer_size=100, **kwargs)
@@ -792,7 +793,7 @@ def test_what_nobody_reads_is_told(tmp_path):
     assert all(one.filename == __file__ for one in told)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        make_dreamer(keys=["vector", "table"])
+        make_dreamer(keys=["vector", "cloud"])
         Dreamer.load(tmp_path / "model", device="cpu")
 
 

@@ -36,7 +36,7 @@ from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertai
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
-from sb3_cpm.world_model.observations import check_action_space, is_3d
+from sb3_cpm.world_model.observations import check_action_space, is_3d, is_cloud
 
 
 class DreamerAlgorithm(OffPolicyAlgorithm):
@@ -144,7 +144,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
     def _warn_of_unread_keys(self) -> None:
         """Beside a player the challenger may leave things out; here nobody else reads them."""
         for key, space in as_dict_space(self.observation_space).items():
-            if key not in self.challenger.keys and not is_3d(space):  # of images without bounds the challenger has told
+            # point clouds are read on request only, and of images without bounds the challenger has told
+            if key not in self.challenger.keys and not is_cloud(space) and not is_3d(space):
                 warnings.warn(
                     f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
                     "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
