@@ -83,16 +83,17 @@ def test_the_first_valid_batch_calibrates_k() -> None:
 
 def test_the_scale_adapts_to_what_the_heads_said_while_they_learnt() -> None:
     """No second prediction of the same transitions, unless they are others."""
-    measure, batch, rated = make(), transitions(600), []
-    raw, rate = measure.raw(batch)[::3].detach(), measure.raw
+    measure, batch, predicted, rated = make(), transitions(600), [], []
+    raw, predict, rate = measure.raw(batch)[::3].detach(), measure.predict, measure.raw
+    measure.predict = lambda given: predicted.append(len(given.feat)) or predict(given)  # type: ignore[method-assign]
     measure.raw = lambda given: rated.append(len(given.feat)) or rate(given)  # type: ignore[method-assign]
     measure.loss(batch)
     assert measure.adapt(batch)["raw_disagreement"] == pytest.approx(raw.mean().item(), rel=1e-5)
-    assert rated == []
+    assert (predicted, rated) == ([600], [])
     measure.loss(batch)
     measure.adapt(transitions(600))
     measure.adapt(batch)
-    assert rated == [200, 200]
+    assert (predicted, rated) == ([600, 600], [200, 200])
 
 
 def test_k_is_moved_by_its_factor_only_outside_of_the_intervals() -> None:
