@@ -405,7 +405,7 @@ def test_heads_one_by_one_are_the_heads_at_once(
     for wanted in ([inputs, *weights], [inputs], weights):
         inputs.requires_grad_(wanted != weights)
         with frozen(*[ensemble] if wanted == [inputs] else []):
-            found = torch.stack(list(ensemble.predictions(inputs))), ensemble(inputs)
+            found = torch.stack(ensemble.predictions(inputs)), ensemble(inputs)
         results = []
         for outputs in found:
             torch.manual_seed(4)
@@ -431,8 +431,10 @@ def test_heads_rate_in_slices_what_they_predict_at_once(
     ensemble = Ensemble(3, 14, 2, layers=3, units=7, one_hot=one_hot)
     with frozen(ensemble):
         assert_equal(*(gradients(of, [inputs]) for of in (ensemble.disagreement, lambda x: disagreement(ensemble(x)))), 1e-4)
-        rated = ensemble.disagreement(inputs)
-    assert [one.shape for one in rated.grad_fn.saved_tensors] == [inputs.shape], "nothing else is kept"
+        kept: list[torch.Tensor] = []
+        with torch.autograd.graph.saved_tensors_hooks(lambda one: kept.append(one) or one, lambda one: one):
+            rated = ensemble.disagreement(inputs)
+    assert [one.shape for one in kept] == [inputs.shape], "its gradient, and nothing else"
     with torch.no_grad():
         assert torch.equal(ensemble.disagreement(inputs), rated)
     learnt = torch.autograd.grad(ensemble.disagreement(inputs).sum(), list(ensemble.parameters()))

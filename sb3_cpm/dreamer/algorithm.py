@@ -36,7 +36,7 @@ from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertai
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
-from sb3_cpm.world_model.observations import check_action_space, is_3d, is_cloud
+from sb3_cpm.world_model.observations import check_action_space, is_cloud, is_rangeless_image
 
 
 class DreamerAlgorithm(OffPolicyAlgorithm):
@@ -145,7 +145,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """Beside a player the challenger may leave things out; here nobody else reads them."""
         for key, space in as_dict_space(self.observation_space).items():
             # point clouds are read on request only, and of images without bounds the challenger has told
-            if key not in self.challenger.keys and not is_cloud(space) and not is_3d(space):
+            if key not in self.challenger.keys and not is_cloud(space) and not is_rangeless_image(space):
                 warnings.warn(
                     f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
                     "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",

@@ -56,17 +56,33 @@ class Ensemble(nn.Module):
                 hidden = elu_(hidden)
         return hidden
 
-    def predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
-        """The same as a sequence of the heads' outputs, each of shape ``(n, output_dim)``, without copying them together."""
+    def predictions(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """
+        The outputs of the heads, one by one, without copying them together.
+
+        :param inputs: shape ``(*batch, input_dim)``
+        :return: of each head, shape ``(*batch, output_dim)``
+        """
+        return [one.unflatten(0, inputs.shape[:-1]) for one in self._predictions(inputs.flatten(0, -2))]
+
+    def disagreement(self, inputs: torch.Tensor) -> torch.Tensor:
+        """
+        What :func:`disagreement` says of the :meth:`predictions`.
+
+        :param inputs: shape ``(*batch, input_dim)``
+        :return: shape ``(*batch,)``, at least 0
+        """
+        return self._disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
+
+    def _predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
         if not self._keeps_a_cpu_busy(inputs):
             return self(inputs).unbind(0)
         return Predictions.apply(inputs, self._choice(inputs), *self.weights, *self.biases)
 
-    def disagreement(self, inputs: torch.Tensor) -> torch.Tensor:
-        """What :func:`disagreement` says of the :meth:`predictions`, shape ``(n,)``."""
+    def _disagreement(self, inputs: torch.Tensor) -> torch.Tensor:
         weights_learn = torch.is_grad_enabled() and self.weights[0].requires_grad
         if weights_learn or not self._keeps_a_cpu_busy(inputs):
-            return disagreement(self.predictions(inputs))
+            return disagreement(self._predictions(inputs))
         return Rating.apply(inputs, self._choice(inputs), *self.weights, *self.biases)
 
     def _keeps_a_cpu_busy(self, inputs: torch.Tensor) -> bool:

@@ -38,12 +38,10 @@ class ObservationEnsemble(ScaledUncertainty):
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:
         """Predicted standardised embeddings of all heads, each of shape ``(*batch, embed_dim)``."""
-        inputs = self._inputs(transitions)
-        return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
+        return self.ensemble.predictions(self._inputs(transitions))
 
     def raw(self, transitions: Transitions) -> torch.Tensor:
-        inputs = self._inputs(transitions)
-        return self.ensemble.disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
+        return self.ensemble.disagreement(self._inputs(transitions))
 
     def _inputs(self, transitions: Transitions) -> torch.Tensor:
         return torch.cat((self.dream(transitions.feat, transitions.embed), transitions.action), dim=-1)

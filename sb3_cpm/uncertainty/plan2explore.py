@@ -51,13 +51,11 @@ class Plan2Explore(ScaledUncertainty):
 
     def predict(self, transitions: Transitions) -> list[torch.Tensor]:
         """Predictions of all heads, each of shape ``(*batch, target_dim)``."""
-        inputs = self._inputs(transitions)
-        return [one.unflatten(0, inputs.shape[:-1]) for one in self.ensemble.predictions(inputs.flatten(0, -2))]
+        return self.ensemble.predictions(self._inputs(transitions))
 
     def disagreement(self, transitions: Transitions) -> torch.Tensor:
         """d: standard deviation over the heads, averaged over the target's dimensions, shape ``(*batch,)``, at least 0."""
-        inputs = self._inputs(transitions)
-        return self.ensemble.disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
+        return self.ensemble.disagreement(self._inputs(transitions))
 
     def _inputs(self, transitions: Transitions) -> torch.Tensor:
         return torch.cat((transitions.feat, transitions.action), dim=-1)
