@@ -7,7 +7,7 @@ Lines are interquartile means over seeds, bands 95% stratified bootstrap interva
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -23,6 +23,18 @@ from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, PURPLE, RED, STYLE
 
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, PINK, BLACK)
+#: Agents of several experiments look alike in all of them; the others take what is left.
+USUAL_COLOURS = {
+    "SAC": BLUE,
+    "CPM-SAC": ORANGE,
+    "CPM tuned": GREEN,
+    "CPM, weak challenges": GREEN,
+    "Plan2Explore": PURPLE,
+    "SAC+HER": RED,
+    "CPM high exploration": BLUE,
+    "CPM simple": ORANGE,
+    "Dreamer": GREEN,
+}
 LEGEND_COLUMNS = 4
 #: Columns of evaluations.csv with the words for them.
 SCORES = {
@@ -77,8 +89,8 @@ PANELS: dict[str, tuple[Panel, ...]] = {
     "plan2explore": (
         Panel("ensemble loss", (_model("uncertainty_loss"),)),
         Panel("k, scale before the exponential function", (_model("exp_scale"),), True),
-        Panel("disagreement before scaling", (_model("raw_disagreement"),), True),
-        Panel("disagreement", (_model("disagreement"),)),
+        Panel("d, disagreement of the ensemble", (_model("raw_disagreement"),), True),
+        Panel("novelty: exp(k d) - 1, or log(d)", (_model("disagreement"),)),
     ),
     "world_model": (
         Panel("image loss", (_model("image_loss"),)),
@@ -140,15 +152,17 @@ def _colours(experiment: Experiment) -> dict[str, str]:
     agents = [contender.name for contender in experiment.contenders]
     if len(agents) > len(COLOURS):
         raise ValueError(f"{experiment.name} has {len(agents)} agents: expected at most {len(COLOURS)}, one per colour")
-    return dict(zip(agents, COLOURS, strict=False))
+    usual = {name: USUAL_COLOURS[name] for name in agents if name in USUAL_COLOURS}
+    left = iter([colour for colour in COLOURS if colour not in usual.values()])
+    return {name: usual.get(name) or next(left) for name in agents}
 
 
-def _line(axes: Axes, scores: pd.DataFrame, colour: str, label: str | None, style: str = "-") -> None:
+def _line(axes: Axes, scores: pd.DataFrame, colour: str, label: str | None, style: str = "-", bands: bool = True) -> None:
     curve = estimate(scores)
     if not len(curve.steps):
         return
     axes.plot(curve.steps, curve.iqm, style, color=colour, label=label and f"{label} ({_seeds(curve.n_seeds)})")
-    if curve.n_seeds > 1:
+    if bands and curve.n_seeds > 1:
         axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, lw=0)
 
 
@@ -159,8 +173,10 @@ def _seeds(*numbers: int) -> str:
     return f"{numbers[0]} seeds" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]} seeds"
 
 
-def _grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    return plt.subplots(rows, columns, figsize=(4.6 * columns, 3.2 * rows + 0.6), squeeze=False, layout="constrained")
+def _grid(rows: int, columns: int, share: Literal["col", "none"] = "none") -> tuple[Figure, np.ndarray]:
+    """:param share: "col" where the axes of a column show the same of several tasks"""
+    size = 4.6 * columns, 3.2 * rows + 0.6
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, sharey=share, layout="constrained")
 
 
 def _nothing(axes: Axes, text: str) -> None:
@@ -172,7 +188,7 @@ def _nothing(axes: Axes, text: str) -> None:
 
 def _draw_scores(experiment: Experiment, table: pd.DataFrame) -> Figure:
     tasks = list(dict.fromkeys(table["env"]))
-    figure, grid = _grid(len(tasks), len(SCORES))
+    figure, grid = _grid(len(tasks), len(SCORES), share="col")
     for task, row in zip(tasks, grid, strict=True):
         of_task = table[table["env"] == task]
         for (score, words), axes in zip(SCORES.items(), row, strict=True):
@@ -183,13 +199,13 @@ def _draw_scores(experiment: Experiment, table: pd.DataFrame) -> Figure:
     return _finished(figure, grid)
 
 
-def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFrame) -> None:
+def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFrame, bands: bool = True) -> None:
     """One score of all agents on one task."""
     colours = _colours(experiment)
     for agent in _agents(experiment, table):
         of_agent = table[table["agent"] == agent].dropna(subset=[score])
         if len(of_agent):
-            _line(axes, per_seed(of_agent, score), colours[agent], agent)
+            _line(axes, per_seed(of_agent, score), colours[agent], agent, bands=bands)
     if not axes.lines:
         _nothing(axes, "this task says nothing about success")
 
@@ -265,14 +281,28 @@ def _draw_panel(axes: Axes, panel: Panel, experiment: Experiment, table: pd.Data
 
 
 def _draw_decays(experiment: Experiment, data: Data) -> Figure:
-    """The schedules, and what became of them: return and success."""
+    """The schedules, and what became of them: return while training, return and success at the end."""
     evaluations, diagnostics = data.tables["evaluations"], data.tables["diagnostics"]
-    figure, grid = _grid(1, 3)
+    figure, grid = _grid(2, 2)
     _draw_panel(grid[0, 0], PANELS["rewards"][0], experiment, diagnostics)
-    for axes, score in zip(grid[0, 1:], ("return", "success_once"), strict=True):
-        axes.set_title(SCORES[score], fontsize=9.5)
-        _draw_score(axes, score, experiment, evaluations)
-    return _finished(figure, grid)
+    grid[0, 1].set_title("return, without intervals", fontsize=9.5)
+    _draw_score(grid[0, 1], "return", experiment, evaluations, bands=False)
+    for axes, score in zip(grid[1], ("return", "success_once"), strict=True):
+        axes.set_title(f"last evaluation: {SCORES[score]}", fontsize=9.5)
+        _draw_ends(axes, score, experiment, evaluations)
+    return _finished(figure, grid[:1])
+
+
+def _draw_ends(axes: Axes, score: str, experiment: Experiment, table: pd.DataFrame) -> None:
+    """Where so many curves end: bands of all would cover each other."""
+    colours, agents = _colours(experiment), _agents(experiment, table)
+    for place, agent in enumerate(agents):
+        scores = per_seed(table[table["agent"] == agent].dropna(subset=[score]), score)
+        if len(scores):
+            curve = estimate(scores)
+            axes.plot([curve.low[-1], curve.high[-1]], [place, place], color=colours[agent], lw=2)
+            axes.plot(curve.iqm[-1], place, "o", color=colours[agent])
+    axes.set(yticks=range(len(agents)), yticklabels=agents, ylim=(len(agents) - 0.5, -0.5))
 
 
 def _panels(name: str) -> Callable[[Experiment, Data], Figure]:
