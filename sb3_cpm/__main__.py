@@ -196,7 +196,12 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
     if list or figure is None:
         print(experiments.listing())
         return 0
-    return experiments.reproduce(figure, **arguments)
+    try:
+        return experiments.reproduce(figure, **arguments)
+    except OSError as error:  # a disk that is full or must not be written; what was written before stays
+        raise RuntimeError(
+            f"{error}. What is finished is kept: free the disk or choose another --results, then call it again."
+        ) from error
 
 
 def _doctor() -> int:

@@ -403,12 +403,148 @@ def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
     shutil.rmtree(tmp_path / "figures", ignore_errors=True)
     assert main(["reproduce", "--figure", "tiny", "--draw-only", "--results", str(tmp_path)]) == 0
     assert (tmp_path / "figures" / "figure_99_tiny.png").stat().st_size > 5000
-    # with other settings than most: left out, and said so
-    config = tmp_path / "tiny" / "CPM" / "toy" / "seed1" / "config.yml"
-    config.write_text(config.read_text().replace("fingerprint: ", "fingerprint: x"))
+
+
+def test_other_settings_than_most_are_left_out(tmp_path, tiny_experiment):
+    specs = list(tiny_experiment.runs(seeds=3, agents=["SAC"]))
+    for spec in specs[:2]:
+        perform(spec, tmp_path)
+    perform(replace(specs[2], overrides={**specs[2].overrides, "gamma": 0.5}), tmp_path)
     data = collect(tiny_experiment, tmp_path)
-    assert any("left out" in note and "CPM/toy/seed1" in note for note in data.notes)
-    assert data.tables["evaluations"].groupby("agent")["seed"].nunique().to_dict() == {"CPM": 1, "SAC": 2}
+    assert data.notes == ["left out, made with other settings than the rest: SAC/toy/seed2"]
+    assert set(data.tables["evaluations"]["seed"]) == {0, 1}
+
+
+@pytest.fixture
+def two_runs(tmp_path, tiny_experiment):
+    specs = list(tiny_experiment.runs(seeds=2, agents=["SAC"]))
+    for spec in specs:
+        perform(spec, tmp_path)
+    return specs
+
+
+def cut(name, start, end):
+    def damage(folder):
+        lines = (folder / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[start:end]))
+
+    return damage
+
+
+def overwrite(name, change):
+    return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+DAMAGES = {
+    "an episode is gone": cut("evaluations.csv", 0, -1),
+    "the last evaluation is gone": cut("evaluations.csv", 0, -2),
+    "the header is gone": cut("evaluations.csv", 1, None),
+    "cut in its last row": overwrite("evaluations.csv", lambda text: text[:-4]),
+    "empty": overwrite("evaluations.csv", lambda text: b""),
+    "not text": overwrite("evaluations.csv", lambda text: b"\xff\xfe\n" + text),
+    "no evaluations": lambda folder: (folder / "evaluations.csv").unlink(),
+    "no diagnostics": lambda folder: (folder / "diagnostics.csv").unlink(),
+    "no settings": lambda folder: (folder / "config.yml").unlink(),
+    "empty settings": overwrite("config.yml", lambda text: b""),
+    "cut settings": overwrite("config.yml", lambda text: text[:200]),
+    "edited settings": overwrite("config.yml", lambda text: text.replace(b"batch_size: 8", b"batch_size: 9")),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_results_are_neither_drawn_nor_kept_silently_nor_taken(tmp_path, tiny_experiment, two_runs, damage):
+    whole = summary_table("tiny", tmp_path)["seeds"].tolist()
+    folder = two_runs[0].folder(tmp_path)
+    DAMAGES[damage](folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    data = collect(tiny_experiment, tmp_path)
+    assert set(data.tables["evaluations"]["seed"]) == set(data.tables["diagnostics"]["seed"]) == {1}
+    assert len(data.notes) == 1 and data.notes[0].startswith("left out, damaged: SAC/toy/seed0 (")
+    assert (whole, summary_table("tiny", tmp_path)["seeds"].tolist()) == ([2], [1])
+    again = attempt(two_runs[0], tmp_path, lambda line: None)
+    assert again.outcome in ("refused", "unchecked") and str(folder) in again.message
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    twin = attempt(replace(two_runs[0], experiment="other"), tmp_path, lambda line: None)
+    assert twin.outcome == "finished", "made, not taken from the damaged one"
+
+
+def test_folders_that_are_no_runs_are_named(tmp_path, tiny_experiment, two_runs):
+    folder = two_runs[0].folder(tmp_path)
+    shutil.copytree(folder, folder.with_name("seed0 copy"))
+    data = collect(tiny_experiment, tmp_path)
+    assert data.notes == ["left out, damaged: SAC/toy/seed0 copy (the folder of a run is called seedN)"]
+    assert len(data.tables["evaluations"]) == 2 * 3 * 2
+
+
+def test_a_diverged_run_is_told_and_no_earlier_step_passed_off(tmp_path, tiny_experiment, two_runs):
+    path = two_runs[0].folder(tmp_path) / "evaluations.csv"
+    table = pd.read_csv(path)
+    table.loc[table.index[-1], "return"] = np.nan
+    table.to_csv(path, index=False, na_rep="nan", lineterminator="\r\n")
+    assert collect(tiny_experiment, tmp_path).notes == ["returns that are no numbers, at which curves end: SAC/toy/seed0"]
+    row = summary_table("tiny", tmp_path).iloc[0]
+    scores = pd.concat([pd.read_csv(spec.folder(tmp_path) / "evaluations.csv") for spec in two_runs]).query("step == 60")
+    assert row["step"] == 60 and row["return"].startswith(f"{scores['return'].mean():.2f} [")
+    assert row["success_once"].startswith(f"{scores['success_once'].mean():.2f} [")
+
+
+def test_mixed_code_and_pytorch_are_noted(tmp_path, tiny_experiment, two_runs):
+    config = two_runs[0].folder(tmp_path) / "config.yml"
+    content = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump({**content, "code": "older", "versions": {**content["versions"], "torch": "2.0"}}))
+    code, torch = collect(tiny_experiment, tmp_path).notes
+    assert "several states of its code are mixed" in code and "older: 1 runs" in code
+    assert "several versions of PyTorch are mixed" in torch and "2.0: 1 runs" in torch
+    made = attempt(replace(two_runs[0], experiment="other"), tmp_path, lambda line: None)
+    assert made.outcome == "finished", "not taken from a run of older code"
+
+
+def test_crashed_runs_are_not_just_unfinished(tmp_path, tiny_experiment, monkeypatch, two_runs):
+    third = list(tiny_experiment.runs(seeds=3, agents=["SAC"]))[2]
+    unbroken = kill_at(monkeypatch, 100)
+    with pytest.raises(Killed):
+        perform(third, tmp_path)
+    unbroken()
+    assert collect(tiny_experiment, tmp_path).notes == [
+        "not finished yet, and drawn as far as they came: SAC/toy/seed2 (at step 60 of 120)"
+    ]
+    (third.folder(tmp_path) / "crashed.txt").write_text("Traceback")
+    assert collect(tiny_experiment, tmp_path).notes == [
+        "crashed, and drawn as far as they came: SAC/toy/seed2 (at step 60 of 120)"
+    ]
+
+
+@pytest.mark.parametrize("damage", ["shorter", "gone", "settings", "state"])
+def test_a_damaged_unfinished_run_does_not_go_on(tmp_path, monkeypatch, damage):
+    spec = make_spec()
+    unbroken = kill_at(monkeypatch, 190)
+    with pytest.raises(Killed):
+        perform(spec, tmp_path)
+    unbroken()
+    folder = spec.folder(tmp_path)
+    tables = csv_files(folder)
+    if damage == "shorter":
+        cut("evaluations.csv", 0, 2)(folder)
+    elif damage == "state":
+        overwrite("checkpoint/state.pkl", lambda content: content[:-20])(folder)
+    else:
+        (folder / {"gone": "evaluations.csv", "settings": "config.yml"}[damage]).unlink()
+    again = attempt(spec, tmp_path, lambda line: None)
+    assert again.outcome == ("refused" if damage == "settings" else "crashed")
+    assert str(folder) in again.message and "emove" in again.message
+    left = csv_files(folder)
+    assert all(tables[name].startswith(text) for name, text in left.items()), "nothing was added or overwritten"
+    assert not (folder / "finished.yml").exists()
+
+
+def test_a_file_in_the_way_is_told_before_anything_runs(tmp_path, tiny_experiment, capsys):
+    (tmp_path / "file").touch()
+    for options in ([], ["--jobs", "0"], ["--draw-only"]):
+        assert main(["reproduce", "--figure", "tiny", "--results", str(tmp_path / "file"), *options]) == 1
+        assert f"{tmp_path / 'file'} is no folder" in capsys.readouterr().err
+    (tmp_path / "tiny").touch()  # where the runs' folders would be: they crash one by one, and it is told
+    assert main(["reproduce", "--figure", "tiny", "--results", str(tmp_path), "--jobs", "0", "--seeds", "1"]) == 1
+    assert "None of the 2 runs" in capsys.readouterr().err
 
 
 def test_trials_are_kept_apart(tmp_path, tiny_experiment, capsys):
@@ -600,6 +736,9 @@ def test_some_agents_and_tasks_only(tmp_path, capsys):
     assert [spec.agent for spec in specs] == ["SAC", "SAC+HER"] and {spec.env for spec in specs} == {specs[0].env}
     with pytest.raises(ValueError, match=r"no agent 'CPM_SAC' in this experiment. Did you mean 'CPM-SAC'\? Valid: SAC, CPM"):
         run_experiment("pickcube-state", agents=["CPM_SAC"], results=tmp_path)
+    for options in ([], ["--draw-only"]):
+        assert main(["reproduce", "--figure", "pickcube-state", "--agents", "SCA", "--results", str(tmp_path), *options]) == 1
+        assert "Did you mean 'SAC'?" in capsys.readouterr().err
     assert main(["reproduce", "--figure", "pickcube-state", "--tasks", "PickCube", "--results", str(tmp_path)]) == 1
     assert "no task 'PickCube'" in capsys.readouterr().err and not list(tmp_path.iterdir())
 

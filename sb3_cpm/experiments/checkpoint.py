@@ -72,8 +72,15 @@ def remove_checkpoints(folder: Path) -> None:
 
 
 def load_extra(checkpoint: Path) -> dict[str, Any]:
-    """:return: what was given to :func:`save_checkpoint`, and ``next_training`` of the challengers"""
-    return pickle.loads((checkpoint / "state.pkl").read_bytes())
+    """
+    :return: what was given to :func:`save_checkpoint`, and ``next_training`` of the challengers
+    :raises ValueError: if the file is damaged
+    """
+    path = checkpoint / "state.pkl"
+    try:
+        return pickle.loads(path.read_bytes())
+    except (pickle.UnpicklingError, EOFError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error}). Remove the folder {checkpoint} to begin the run anew.") from error
 
 
 def restore_buffer(checkpoint: Path, model: BaseAlgorithm) -> None:

@@ -203,8 +203,8 @@ def _draw_score(axes: Axes, score: str, experiment: Experiment, table: pd.DataFr
     """One score of all agents on one task."""
     colours = _colours(experiment)
     for agent in _agents(experiment, table):
-        of_agent = table[table["agent"] == agent].dropna(subset=[score])
-        if len(of_agent):
+        of_agent = table[table["agent"] == agent]
+        if of_agent[score].notna().any():
             _line(axes, per_seed(of_agent, score), colours[agent], agent, bands=bands)
     if not axes.lines:
         _nothing(axes, "this task says nothing about success")
@@ -297,7 +297,7 @@ def _draw_ends(axes: Axes, score: str, experiment: Experiment, table: pd.DataFra
     """Where so many curves end: bands of all would cover each other."""
     colours, agents = _colours(experiment), _agents(experiment, table)
     for place, agent in enumerate(agents):
-        scores = per_seed(table[table["agent"] == agent].dropna(subset=[score]), score)
+        scores = per_seed(table[table["agent"] == agent], score)
         if len(scores):
             curve = estimate(scores)
             axes.plot([curve.low[-1], curve.high[-1]], [place, place], color=colours[agent], lw=2)

@@ -13,9 +13,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_cpm.experiments.run_folder import LockedError, OtherResultError, is_finished, write_crashed
+from sb3_cpm.experiments.run_folder import CRASHED, LockedError, OtherResultError, is_finished, write_crashed
 from sb3_cpm.experiments.single_run import RunResult, perform
 from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.stored_run import DamagedRunError
 
 Tell = Callable[[str], None]
 #: What a worker process ends with, by outcome; every other status is a crash.
@@ -48,7 +49,7 @@ def attempt(spec: RunSpec, results: Path, tell: Tell = print, device: str = "cpu
     folder = spec.folder(results)
     try:
         return perform(spec, results, tell, device)
-    except (OtherResultError, LockedError) as error:
+    except (OtherResultError, LockedError, DamagedRunError) as error:
         return RunResult(spec, "refused", str(error), folder)
     except Exception as error:
         if is_finished(folder):
@@ -104,5 +105,6 @@ class _Pool:
             if outcome == "crashed" and status != 1:  # it could not write that itself
                 how = f"signal {-status}" if status < 0 else f"status {status}"
                 write_crashed(folder, f"The process of this run ended with {how}.\n")
-            self._outcomes[index] = RunResult(spec, outcome, f"process ended with {status}", folder)
+            told = f"see {folder / CRASHED}" if outcome == "crashed" and (folder / CRASHED).exists() else "see above"
+            self._outcomes[index] = RunResult(spec, outcome, f"process ended with {status}, {told}", folder)
             self.tell(f"[{len(self._outcomes)}/{len(self.specs)}] {spec.name}: {outcome}")

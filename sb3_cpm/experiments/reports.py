@@ -52,10 +52,14 @@ def run_experiment(
         seeds or steps than one
     """
     experiment = find_experiment(name)
-    if seeds is not None and seeds < 1:
-        raise ValueError(f"seeds={seeds}: expected 1 or more")
+    _check_seeds(seeds)
     specs = list(experiment.runs(version, seeds, steps, agents, tasks))
     return perform_all(specs, Path(results), jobs, tell, device)
+
+
+def _check_seeds(seeds: int | None) -> None:
+    if seeds is not None and seeds < 1:
+        raise ValueError(f"seeds={seeds}: expected 1 or more")
 
 
 def ensure_data(
@@ -155,12 +159,13 @@ def summary_table(name: str, results: str | Path = RESULTS, version: str = "full
 
 
 def _last(part: pd.DataFrame) -> dict[str, object]:
-    row: dict[str, object] = {"seeds": part["seed"].nunique()}
+    returns = per_seed(part, "return")
+    step = int(returns.index[-1]) if len(returns) else None
+    row: dict[str, object] = {"seeds": part["seed"].nunique(), "step": "-" if step is None else step}
     for score in SUMMARY_SCORES:
-        scores = per_seed(part.dropna(subset=[score]), score) if part[score].notna().any() else pd.DataFrame()
+        scores = per_seed(part[part["step"] == step], score)
         if len(scores):
-            last = estimate(scores.iloc[[-1]])
-            row.setdefault("step", int(last.steps[0]))
+            last = estimate(scores)
             row[score] = f"{last.iqm[0]:.2f} [{last.low[0]:.2f}, {last.high[0]:.2f}]"
         else:
             row[score] = "-"
@@ -197,10 +202,13 @@ def reproduce(
     """
     experiment = find_experiment(name)
     version = experiment.trial(version, steps)
+    if Path(results).exists() and not Path(results).is_dir():
+        raise ValueError(f"--results {results} is no folder")
+    _check_seeds(seeds)
+    n_runs = len(list(experiment.runs(version, seeds, None, agents, tasks)))  # names that there are not are refused here
     failed: list[RunResult] = []
     if not draw_only:
         plan = experiment.plan(version)
-        n_runs = len(list(experiment.runs(version, seeds, None, agents, tasks)))
         tell(f"{experiment.name}: {n_runs} runs of {plan.steps} steps ({plan.cost}); what is there is skipped")
         outcomes = run_experiment(name, version, results, seeds, jobs, tell, None, device, agents, tasks)
         failed = [outcome for outcome in outcomes if outcome.outcome in ("crashed", "refused", "unchecked")]

@@ -14,6 +14,8 @@ The folder of one run: who may write there, and what its state is.
 
 import contextlib
 import fcntl
+import functools
+import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,8 +57,19 @@ def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
         "protocol": protocol,
         "fingerprint": fingerprint(protocol),
         "sb3_cpm": __version__,
+        "code": code_digest(),
         "versions": {name: version for name, version in versions().items() if name != "command"},
     }
+
+
+@functools.cache
+def code_digest() -> str:
+    """:return: twelve characters that differ whenever a module of this package does: between releases the version does not"""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @contextlib.contextmanager
@@ -152,7 +165,7 @@ def write_crashed(folder: Path, text: str) -> bool:
                 return False
             write_text(folder / CRASHED, text)
             return True
-    except LockedError:
+    except (LockedError, OSError):  # a full disk: what the crash was is told by whoever saw it
         return False
 
 

@@ -18,14 +18,14 @@ from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.evaluation import evaluate, success_of
 from sb3_cpm.experiments.player_losses import log_player_losses
 from sb3_cpm.experiments.specification import RunSpec
-from sb3_cpm.experiments.tables import DIAGNOSTICS, EVALUATIONS, TRAINING, DiagnosticsWriter, Table
+from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
+from sb3_cpm.experiments.tables import COLUMNS, DiagnosticsWriter, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.run.settings import check_seed
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
 N_DUMPS = 50
-COLUMNS = {"evaluations": EVALUATIONS, "training": TRAINING, "diagnostics": DIAGNOSTICS}
 
 
 class RunResult(NamedTuple):
@@ -54,6 +54,7 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     :param tell: is given a line now and then
     :param device: PyTorch device; small networks are fastest on the CPU
     :raises LockedError: while another process makes the same run
+    :raises DamagedRunError: if the result is there, but files of it are missing or were cut off
     :raises ValueError: for an unknown agent or environment, for wrong hyperparameters, for a seed that evaluation may have,
         and if the folder holds a run with other hyperparameters
     """
@@ -61,17 +62,22 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     agent = load_agent(spec.config, spec.env_id, spec.overrides)
     check_seed(spec.seed, agent.n_envs)
     config = run_folder.description(spec, agent)
-    note = run_folder.check_belongs(folder, config)
-    if run_folder.is_finished(folder):
-        run_folder.remove_crashed(folder)  # of a try that ended before it saw that
-        return RunResult(spec, "skipped", note or "its result is there", folder)
     th.set_num_threads(1)
     th.set_flush_denormal(True)  # Adam's averages of units that are off decay to numbers that cost CPUs a tenth of an update
     with run_folder.locked(folder):
+        note = run_folder.check_belongs(folder, config)
+        if run_folder.is_finished(folder):
+            _check_whole(folder)
+            run_folder.remove_crashed(folder)  # of a try that ended before it saw that
+            return RunResult(spec, "skipped", note or "its result is there", folder)
         started = time.perf_counter()
         found = checkpoints.find_checkpoint(folder)
         if found is not None and note is not None:
             raise run_folder.OtherResultError(f"{folder} holds an unfinished run {note}: finish it there, or remove it.")
+        if found is not None and not (folder / run_folder.CONFIG).exists():
+            raise DamagedRunError(
+                f"{folder} holds a checkpoint, but no {run_folder.CONFIG} that says of what run. Remove it to run it again."
+            )
         twin = None if found is not None else find_twin(spec, config, results)
         if twin is not None:
             return RunResult(spec, "skipped", f"taken from {take_over(spec, config, twin, results)}", folder)
@@ -87,6 +93,13 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
         run_folder.write_finished(folder, facts)
         checkpoints.remove_checkpoints(folder)
     return RunResult(spec, "finished", f"{seconds:.0f} s", folder)
+
+
+def _check_whole(folder: Path) -> None:
+    try:
+        read_run(folder)
+    except DamagedRunError as error:
+        raise DamagedRunError(f"{folder} is damaged: {error}. Remove it to run it again.") from error
 
 
 class Watcher(BaseCallback):

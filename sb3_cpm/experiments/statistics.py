@@ -38,9 +38,11 @@ class Estimate(NamedTuple):
 def per_seed(table: pd.DataFrame, value: str) -> pd.DataFrame:
     """
     :param table: with the columns ``seed``, ``step`` and the value, episodes as rows
-    :return: mean over the episodes; a row per step that all seeds have, a column per seed
+    :return: mean over the episodes; a row per step that all seeds have, a column per seed; where a value is NaN or infinite a
+        seed does not have that step
     """
-    return table.groupby(["step", "seed"])[value].mean().unstack("seed").dropna()
+    means = table.groupby(["step", "seed"])[value].agg(lambda values: values.mean(skipna=False)).unstack("seed")
+    return means.where(np.isfinite(means)).dropna()
 
 
 def estimate(scores: pd.DataFrame, repetitions: int = REPETITIONS) -> Estimate:

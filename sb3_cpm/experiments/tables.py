@@ -21,6 +21,8 @@ EVALUATIONS = (
 )
 TRAINING = ("step", "env_idx", "return", "length", "success_once", "success_at_end")
 DIAGNOSTICS = ("step", "name", "value")
+COLUMNS = {"evaluations": EVALUATIONS, "training": TRAINING, "diagnostics": DIAGNOSTICS}
+"""Of the files of a run, by name."""
 
 
 class Table:
@@ -30,11 +32,18 @@ class Table:
     :param path: of the file, made with a header where there is none
     :param columns: its columns
     :param size: bytes to keep of a file that is there already; None: all
+    :raises ValueError: if the file has fewer
     """
 
     def __init__(self, path: Path, columns: Sequence[str], size: int | None = None) -> None:
         self.path, self.columns = path, tuple(columns)
-        if path.exists() and size is not None:
+        there = path.stat().st_size if path.exists() else 0
+        if size is not None and there < size:
+            raise ValueError(
+                f"{path} has {there} bytes, it had {size} when the checkpoint beside it was made: it was damaged. "
+                "Remove the folder to run it again."
+            )
+        if there and size is not None:
             with path.open("rb+") as file:
                 file.truncate(size)
         self._file: TextIO = path.open("a", newline="", encoding="utf-8")

@@ -11,6 +11,7 @@ from typing import Any
 
 from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
 from sb3_cpm.experiments.tables import EVALUATIONS, Table
 
 
@@ -19,15 +20,19 @@ def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | No
     :param spec: a run
     :param config: its :func:`~sb3_cpm.experiments.run_folder.description`
     :param results: folder of all results
-    :return: the folder of a finished run with the same settings, seed and version of this package, under another name
+    :return: the folder of a finished run with the same settings, seed, version and code of this package, under another name
     """
     own = spec.folder(results)
     for path in sorted(results.glob(f"*/*/*/{own.name}/{run_folder.CONFIG}")):
         folder = path.parent
         if folder == own or not run_folder.is_finished(folder):
             continue
-        theirs = run_folder.read_yaml(path)
-        if all(theirs.get(key) == config[key] for key in ("fingerprint", "sb3_cpm")):
+        try:
+            theirs = read_run(folder).config
+        except DamagedRunError:  # told by whoever draws it
+            continue
+        same = all(theirs.get(key) == config[key] for key in ("fingerprint", "sb3_cpm"))
+        if same and theirs.get("code", config["code"]) == config["code"]:
             return folder
     return None
 
@@ -43,6 +48,7 @@ def take_over(spec: RunSpec, config: dict[str, Any], twin: Path, results: Path) 
     :return: the twin's name
     """
     folder, name = spec.folder(results), "/".join(twin.parts[-4:])
+    theirs, finished = (run_folder.read_yaml(twin / file) for file in (run_folder.CONFIG, run_folder.FINISHED))
     names = {"experiment": spec.experiment, "agent": spec.agent, "env": spec.env}
     for path in twin.glob("*.csv"):
         if path.stem != "evaluations":
@@ -53,7 +59,8 @@ def take_over(spec: RunSpec, config: dict[str, Any], twin: Path, results: Path) 
             for row in csv.DictReader(file):
                 table.add([{**row, **names}[column] for column in EVALUATIONS])
         table.close()
-    versions = run_folder.read_yaml(twin / run_folder.CONFIG)["versions"]
-    run_folder.write_config(folder, {**config, "versions": versions, "taken_from": name})
-    run_folder.write_finished(folder, run_folder.read_yaml(twin / run_folder.FINISHED))
+    code = {"code": theirs["code"]} if "code" in theirs else {}
+    ours = {key: value for key, value in config.items() if key != "code"}
+    run_folder.write_config(folder, {**ours, **code, "versions": theirs["versions"], "taken_from": name})
+    run_folder.write_finished(folder, finished)
     return name
