@@ -6,6 +6,7 @@ machine where something is missing.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, fields
@@ -37,6 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = options.pop("command")
     try:
         return command(**options)
+    except BrokenPipeError:  # whoever reads our lines, as `head`, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt:
         return 130
     except (ValueError, RuntimeError) as error:
@@ -198,6 +202,8 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
         return 0
     try:
         return experiments.reproduce(figure, **arguments)
+    except BrokenPipeError:
+        raise
     except OSError as error:  # a disk that is full or must not be written; what was written before stays
         raise RuntimeError(
             f"{error}. What is finished is kept: free the disk or choose another --results, then call it again."

@@ -178,7 +178,7 @@ _ALL = (
         "PPO succeeds seldom on PickCube and never on the other tasks",
         (PPO_RGBD,),
         "curves",
-        Plan(VISUAL, 200_000, 20_000, 20, 5, cost="1 to 2 hours per run on a core"),
+        Plan(VISUAL, 200_000, 20_000, 20, 5, cost="3 to 4 CPU hours per run"),
         _PPO_QUICK,
         short=replace(_SHORT, tasks=tuple(task for task in VISUAL if task.name in ("PickCube-v1", "StackCube-v1"))),
     ),
@@ -269,7 +269,7 @@ _ALL = (
         "the report's appendix B.4 is empty",
         DECAYS,
         "decays",
-        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 5, cost="90 CPU seconds per run"),
+        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 5, cost="2 to 4 CPU minutes per run, by processor"),
         Plan((TOY,), 1500, 500, 5, 1, SMALL, cost="3 minutes on 2 cores"),
     ),
 )
