@@ -606,6 +606,65 @@ def test_load_without_environment_and_with_everything_that_sb3_offers(tmp_path):
     assert np.array_equal(DreamerPolicy.load(policy_file, device="cpu").predict(observation, deterministic=True)[0], wanted)
 
 
+@pytest.mark.parametrize("kind", [Dreamer, Plan2Explore])
+def test_a_loaded_model_takes_other_rates_and_constants(tmp_path, kind):
+    model = make(kind=kind).learn(80)
+    model.save(tmp_path / "model")
+    changed = {"model_lr": 5e-4, "actor_lr": 2e-5, "adam_eps": 1e-4, "horizon": 3, "batch_size": 2, "gamma": 0.5}
+    loaded = kind.load(tmp_path / "model", env=toy(), device="cpu", preset=changed, keys=["state"])
+    assert_same_weights(model, loaded)
+    assert loaded.challenger.preset == {**model.challenger.preset, **changed}
+    assert loaded.learning_rate == 5e-4 and loaded.batch_size == 2 and loaded.gamma == 0.5
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=False)
+    loaded.train(1)
+    now = rates(loaded)
+    assert now["world_model"] == 5e-4
+    assert now[f"{loaded.behavior}_actor"] == pytest.approx(2e-5)
+    assert {one.adam.param_groups[0]["eps"] for one in loaded.challenger.optimizers.values()} == {1e-4}
+    loaded.save(tmp_path / "again")
+    assert kind.load(tmp_path / "again", device="cpu").challenger.preset == loaded.challenger.preset
+    # the schedule's start is what the user gives it
+    given = kind.load(tmp_path / "model", device="cpu", preset={"model_lr": 5e-4}, learning_rate=1e-5)
+    assert given.learning_rate == 1e-5
+
+
+def assert_same_weights(one, other) -> None:
+    first, second = weights(one), weights(other)
+    assert first.keys() == second.keys() and all(np.array_equal(first[key], second[key]) for key in first)
+
+
+@pytest.mark.parametrize(
+    "kind, given, message",
+    [
+        (
+            Dreamer,
+            {"preset": {"deter_size": 20}},
+            r"model cannot be loaded with \{'deter_size': 20\}; .*size mismatch for networks",
+        ),
+        (Dreamer, {"preset": "report"}, r"'deter_size': 200"),
+        (Dreamer, {"keys": ["target"]}, r"cannot be loaded with \{'keys': \['target'\]\}"),
+        (Plan2Explore, {"train_task_behavior": True}, r"\{'train_task_behavior': True\}; .*task"),
+        (Plan2Explore, {"uncertainty_class": "rnd"}, r"\{'uncertainty_class': 'rnd'\}"),
+        (Dreamer, {"preset": {"gama": 1}}, "Did you mean 'gamma'"),
+    ],
+)
+def test_a_loaded_model_keeps_its_networks(tmp_path, kind, given, message):
+    make(toy("state", "camera"), kind=kind).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=message):
+        kind.load(tmp_path / "model", device="cpu", **given)
+
+
+def test_what_a_loaded_model_began_with_is_past(tmp_path):
+    model = make(start_from=make(kind=Plan2Explore), pretrain_steps=3).learn(80)
+    model.save(tmp_path / "model")
+    with pytest.warns(UserWarning, match="`start_from` plays no role any more"):
+        loaded = Dreamer.load(tmp_path / "model", device="cpu", start_from="explorer.zip")
+    assert_same(model, loaded)
+    with pytest.warns(UserWarning, match="`pretrain_steps` plays no role any more"):
+        Dreamer.load(tmp_path / "model", device="cpu", pretrain_steps=5)
+
+
 def test_parameters_by_sb3s_methods():
     model, other = make().learn(80), make(seed=3)
     assert set(model.get_parameters()) == {

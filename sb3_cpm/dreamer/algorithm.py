@@ -21,9 +21,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_pkl
+from stable_baselines3.common.save_util import load_from_pkl, load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
+from typing_extensions import Self
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import check_environment
@@ -37,6 +38,9 @@ from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
 from sb3_cpm.world_model.observations import check_action_space, is_cloud, is_rangeless_image
+
+#: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
+_OF_CONSTRUCTOR = ("preset", "keys", "start_from", "uncertainty_class", "uncertainty_kwargs", "train_task_behavior")
 
 
 class DreamerAlgorithm(OffPolicyAlgorithm):
@@ -361,6 +365,63 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         finally:
             self._random_state = None
 
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: Any = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """
+        As SB3's. A preset that is given changes rates and constants of the saved model; its networks keep their sizes.
+
+        :param path: of the file
+        :param env: to go on in
+        :param device: PyTorch device
+        :param custom_objects: saved attributes to replace
+        :param print_system_info: of the saved model and of this machine
+        :param force_reset: reset ``env`` before training
+        :param kwargs: arguments of the constructor to change; ``preset`` is a name, or the entries that differ from the saved
+            ones. ``start_from`` and ``pretrain_steps`` mean nothing to a model that has learnt, and are told with a warning
+        :raises ValueError: for arguments that ask for other networks than the saved ones
+        """
+        given = {name: kwargs.pop(name) for name in _OF_CONSTRUCTOR if kwargs.get(name) is not None}
+        if given.pop("start_from", None) is not None:
+            warnings.warn(f"`start_from` plays no role any more: the model goes on from {path}.", stacklevel=2)
+        objects, changes = dict(custom_objects or {}), {}
+        if given:
+            data, _, _ = load_from_zip_file(path, custom_objects=custom_objects, device="cpu")
+            assert data is not None
+            saved, wanted = data["policy_kwargs"], _changed(data["policy_kwargs"], given)
+            preset = wanted["preset"]
+            changes = {name: value for name, value in wanted.items() if name != "preset" and value != saved[name]}
+            changes |= {name: value for name, value in preset.items() if value != saved["preset"][name]}
+            objects["policy_kwargs"] = wanted
+            kwargs = {"batch_size": preset["batch_size"], "gamma": preset["gamma"], **kwargs}
+            if "model_lr" in changes:
+                kwargs = {"learning_rate": preset["model_lr"], **kwargs}
+        try:
+            model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, TypeError, ValueError) as error:
+            if not changes:
+                raise
+            reason = str(error).rpartition("\n")[2].strip()  # torch has a line for every weight that does not fit
+            raise ValueError(
+                f"{path} cannot be loaded with {changes}; a saved model keeps its networks, rates and constants may change: "
+                f"{reason}"
+            ) from error
+        if "adam_eps" in changes:  # the optimizers' saved states have the saved one
+            for optimizer in model.challenger.optimizers.values():
+                for group in optimizer.adam.param_groups:
+                    group["eps"] = changes["adam_eps"]
+        if kwargs.get("pretrain_steps") and model.challenger.trained_updates:
+            warnings.warn(f"`pretrain_steps` plays no role any more: {path} has learnt already.", stacklevel=2)
+        return model
+
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
         Load what ``save_replay_buffer`` saved, of this model or of another one in the same environment.
@@ -379,6 +440,20 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if isinstance(buffer, CPMBuffer):
             buffer.challenge_ratio = 0.0  # challenges are for a player
         self.replay_buffer = buffer
+
+
+def _changed(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param saved: arguments that a model's policy was made with
+    :param given: arguments of the constructor that replace them
+    :return: arguments for the policy
+    """
+    preset = given.get("preset", {})
+    entries = {name: saved["preset"][name] for name in ("train_task_behavior", "train_exploration_behavior")}
+    entries.update((name, given[name]) for name in ("train_task_behavior",) if name in given)
+    complete = make_preset(preset if isinstance(preset, str) else {**saved["preset"], **preset}, **entries)
+    rest = {name: given[name] for name in ("keys", "uncertainty_class", "uncertainty_kwargs") if name in given}
+    return {**saved, **rest, "preset": complete}
 
 
 class _Spaces:
