@@ -655,3 +655,32 @@ def test_optimize_and_train_with_a_trial(tmp_path: Path) -> None:
     values = dict(yaml.unsafe_load(saved))
     assert search.OURS not in values and {"challenge_ratio", "mix"} <= set(values["replay_buffer_kwargs"])
     assert "decay" in values["callback"][0]["sb3_cpm.ChallengerCallback"]
+    for option in ("--conf", "--c", "-c", "-conf=my.yml", "--conf-file=my.yml"):  # argparse takes them all
+        assert str(config_folder() / "dreamer.yml") not in complete("train", ["--algo", "dreamer", option, "my.yml"]), option
+class Broken(gym.Env):
+    """Fails in the middle of a run, in code that is not ours."""
+
+    observation_space = spaces.Dict({"state": spaces.Box(-1, 1, (2,), np.float32)})
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        raise ValueError("cannot open gripper")
+
+
+@pytest.mark.usefixtures("_same_arguments")
+def test_errors_of_a_run_keep_their_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if "Broken-v0" not in gym.registry:
+        gym.register("Broken-v0", entry_point=Broken)
+    path = tmp_path / "my_sac.yml"
+    entry = {"n_timesteps": 5, "policy": "MultiInputPolicy"}
+    arguments = ["train", "--algo", "sac", "--env", "Broken-v0", "-f", str(tmp_path), "--device", "cpu", "--conf", str(path)]
+    path.write_text(yaml.safe_dump({"Broken-v0": entry}))
+    with pytest.raises(ValueError, match="cannot open gripper"):
+        main(arguments)
+    path.write_text(yaml.safe_dump({"Broken-v0": {**entry, "gama": 1}}))
+    assert main(arguments) == 1 and "unknown key 'gama'. Did you mean 'gamma'" in capsys.readouterr().err
+
+

@@ -12,6 +12,7 @@ All options are rl_zoo3's own but one: ``--agent NAME`` stands for ``--algo ALGO
 
 import importlib
 import sys
+import traceback
 from collections.abc import Sequence
 
 #: Commands, and the module and function where rl_zoo3 has them; a module without a function is a script.
@@ -51,9 +52,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         register_robotics(_option("--env", rest))
         _run(COMMANDS[command])
     except ValueError as error:
+        if not _explains_itself(error):
+            raise
         sys.stderr.write(f"error: {error}\n")
         return 1
     return 0
+
+
+def _explains_itself(error: ValueError) -> bool:
+    """Whether rl_zoo3 or we have refused what was asked for; whatever else a run fails of needs its traceback."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    package = frames[-1].f_globals.get("__name__", "").partition(".")[0]
+    return package in ("rl_zoo3", "sb3_cpm") and all(frame.f_code.co_name != "collect_rollouts" for frame in frames)
 
 
 def _run(place: str) -> None:
@@ -70,6 +80,12 @@ def _option(name: str, arguments: Sequence[str]) -> str:
     """What follows an option, "" where nothing does."""
     places = [place for place, argument in enumerate(arguments[:-1]) if argument == name]
     return arguments[places[0] + 1] if places else ""
+
+
+def _names_config(argument: str) -> bool:
+    """Whether it is rl_zoo3's option for the configuration, written out or in one of the short forms that argparse takes."""
+    option = argument.partition("=")[0]
+    return option.strip("-") != "" and any(name.startswith(option) for name in ("-conf", "--conf-file"))
 
 
 def complete(command: str, arguments: Sequence[str]) -> list[str]:
@@ -90,7 +106,7 @@ def complete(command: str, arguments: Sequence[str]) -> list[str]:
         of_agent = ["--algo", algorithm_of(path.stem)]
         completed[at : at + 2] = [*of_agent, "--conf-file", str(path)] if command == "train" else of_agent
     algo = _option("--algo", completed)
-    if command == "train" and algo in ("dreamer", "plan2explore") and not {"-conf", "--conf-file"} & set(completed):
+    if command == "train" and algo in ("dreamer", "plan2explore") and not any(map(_names_config, completed)):
         completed += ["--conf-file", str(find_config(algo))]
     return completed
 
