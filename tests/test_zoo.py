@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import optuna
 import standin_assets
 import torch as th
 import yaml
@@ -429,6 +430,59 @@ def test_dreamer_trials_keep_the_preset(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------------- continued runs
+CONFIGURED = {
+    "n_timesteps": 10,
+    "policy": "MultiInputPolicy",
+    "policy_kwargs": {"share_features_extractor": False},
+    "replay_buffer_class": "CPMBuffer",
+    "replay_buffer_kwargs": {"filter_kwargs": {"w1": 3.0}},
+    "callback": {"sb3_cpm.ChallengerCallback": {"preset": "report"}},
+}
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> dict[str, Any]:
+    """What ``--storage --study-name --trial-id`` say of a study with two trials, the second of which is ours."""
+    storage = optuna.storages.journal.JournalFileBackend(str(tmp_path / "study.log"))
+    made = optuna.create_study(storage=optuna.storages.JournalStorage(storage), study_name="s")
+    sampled = FixedTrial()
+    HYPERPARAMS_SAMPLER["sac"](sampled, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
+    params = {**sampled.params, "challenge_ratio": 0.4, "challenge_mix": "row", "decay": "linear"}
+    trial = optuna.trial.create_trial(
+        params=params,
+        distributions={name: optuna.distributions.CategoricalDistribution([value]) for name, value in params.items()},
+        value=1.0,
+    )
+    made.add_trials([trial, trial])
+    return {"storage": str(tmp_path / "study.log"), "study_name": "s", "trial_id": 1}
+
+
+@pytest.mark.parametrize("kind", ["yml", "py", "module"])
+def test_a_trial_goes_into_any_configuration(
+    kind: str, study: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"trial_of_sac.{'yml' if kind == 'yml' else 'py'}"
+    entries = {TOY: CONFIGURED}
+    path.write_text(yaml.safe_dump(entries) if kind == "yml" else f"hyperparams = {entries!r}")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "trial_of_sac", raising=False)
+    config = "trial_of_sac" if kind == "module" else str(path)
+    found, _ = manager_of("sac", tmp_path, 10, config=config, **study).read_hyperparameters()
+    assert found["policy_kwargs"]["share_features_extractor"] is False and "net_arch" in found["policy_kwargs"]
+    assert found["replay_buffer_kwargs"] == {"filter_kwargs": {"w1": 3.0}, "challenge_ratio": 0.4, "mix": "row"}
+    assert found["callback"] == [{"sb3_cpm.ChallengerCallback": {"preset": "report", "decay": "linear"}}]
+    assert search.OURS not in found
+
+
+def test_the_command_line_wins_over_a_trial(study: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "my_sac.yml"
+    path.write_text(yaml.safe_dump({TOY: CONFIGURED}))
+    given = {"replay_buffer_kwargs": {"challenge_ratio": 0.1}, "policy_kwargs": {"net_arch": [3]}, "gamma": 0.5}
+    found, saved = manager_of("sac", tmp_path, 10, config=str(path), hyperparams=given, **study).read_hyperparameters()
+    assert {name: found[name] for name in given} == {name: saved[name] for name in given} == given
+    assert found["callback"] == [{"sb3_cpm.ChallengerCallback": {"preset": "report", "decay": "linear"}}]
+
+
 class AtStart(BaseCallback):
     """What a run begins with."""
 

@@ -31,12 +31,14 @@ def _reading(original: Callable[..., Any]) -> Callable[..., Any]:
     def read_hyperparameters(manager: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         checks.check_environment_names(manager.config, manager.env_name.gym_id)
         hyperparameters, _ = original(manager)
-        hyperparameters = search.with_trial(hyperparameters, manager)
+        if configured is not None:
+            hyperparameters = search.with_trial(hyperparameters, configured, manager.custom_hyperparams or {})
         if manager._eval_env_kwargs_args is None and "env_kwargs" in hyperparameters:
             manager.eval_env_kwargs = hyperparameters["env_kwargs"]  # rl_zoo3 gives them to the training environments only
         checks.check_hyperparameters(hyperparameters, manager.algo, manager.env_name.gym_id, manager.config)
         return hyperparameters, dict(sorted(hyperparameters.items()))
 
+        configured = search.without_trial(original, manager)
     return read_hyperparameters
 
 

@@ -9,12 +9,12 @@ a copy of the manager (trials may run in threads), and ``policy_kwargs`` of the 
 import contextlib
 import contextvars
 import copy
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+import io
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.zoo.checks import find_entry, named_with_arguments, read_entries
+from sb3_cpm.zoo.checks import named_with_arguments
 
 #: Key under which the converter hands our part of a trial to :func:`with_trial`.
 OURS = "cpm_trial"
@@ -151,21 +151,38 @@ def sampled(manager: Any, trial: Any) -> Iterator[Any]:
         _configured.reset(token)
 
 
-def with_trial(hyperparameters: dict[str, Any], manager: Any) -> dict[str, Any]:
+def without_trial(read: Callable[[Any], Any], manager: Any) -> dict[str, Any] | None:
+    """
+    What the configuration says where ``--trial-id`` is about to replace some of it, in any form that rl_zoo3 reads.
+
+    :param read: rl_zoo3's ``ExperimentManager.read_hyperparameters``
+    :param manager: rl_zoo3's ``ExperimentManager``
+    :return: hyperparameters without those of trial and command line; None where there is no trial
+    """
+    if not (manager.storage and manager.study_name and manager.trial_id):
+        return None
+    plain = copy.copy(manager)
+    plain.trial_id = plain.custom_hyperparams = None
+    with contextlib.redirect_stdout(io.StringIO()):  # rl_zoo3 prints what it reads
+        hyperparameters, _ = read(plain)
+    return copy.deepcopy(hyperparameters)  # that of an imported module is changed in place
+
+
+def with_trial(
+    hyperparameters: Mapping[str, Any], configured: Mapping[str, Any], command_line: Collection[str]
+) -> dict[str, Any]:
     """
     Hyperparameters in which ``--trial-id`` has replaced some, with our part of the trial where it belongs.
 
-    :param hyperparameters: what rl_zoo3 has read
-    :param manager: rl_zoo3's ``ExperimentManager``
+    :param hyperparameters: what rl_zoo3 has read, trial and command line included
+    :param configured: what the configuration alone says
+    :param command_line: names of those that were given with ``-params``, which stay
     """
-    if not (manager.storage and manager.study_name and manager.trial_id):
-        return hyperparameters
-    path = Path(manager.config)
-    configured = find_entry(read_entries(path), manager.env_name.gym_id, path)
     merged = _with_policy_kwargs(dict(hyperparameters), configured)
     if isinstance(configured.get("preset"), dict) and isinstance(merged.get("preset"), dict):
         merged["preset"] = {**configured["preset"], **merged["preset"]}
-    return applied(merged.pop(OURS, {}), merged)
+    ours = merged.pop(OURS, {})
+    return {**applied(ours, merged), **{name: hyperparameters[name] for name in command_line}}
 
 
 def applied(values: Mapping[str, Any], hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
