@@ -4,6 +4,7 @@ import argparse
 import copy
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,8 +13,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import pytest
 import optuna
+import pytest
 import standin_assets
 import torch as th
 import yaml
@@ -429,7 +430,6 @@ def test_dreamer_trials_keep_the_preset(tmp_path: Path) -> None:
     assert HYPERPARAMS_CONVERTER["dreamer"](trial.params)["preset"]["gamma"] == 0.9
 
 
-# ---------------------------------------------------------------------- continued runs
 CONFIGURED = {
     "n_timesteps": 10,
     "policy": "MultiInputPolicy",
@@ -483,6 +483,7 @@ def test_the_command_line_wins_over_a_trial(study: dict[str, Any], tmp_path: Pat
     assert found["callback"] == [{"sb3_cpm.ChallengerCallback": {"preset": "report", "decay": "linear"}}]
 
 
+# ---------------------------------------------------------------------- continued runs
 class AtStart(BaseCallback):
     """What a run begins with."""
 
@@ -577,6 +578,152 @@ def test_what_stops_a_run_does_not_keep_the_challenger_from_being_saved(tmp_path
     assert made[0].num_timesteps == 110 and (Path(manager.save_path) / "challenger.pt").is_file()
 
 
+TINY = {
+    "n_timesteps": 60,
+    "policy": "MultiInputPolicy",
+    "policy_kwargs": {"net_arch": [8]},
+    "env_kwargs": {"keys": ["state"]},
+    "replay_buffer_class": "CPMHerReplayBuffer",
+    "replay_buffer_kwargs": {"challenge_ratio": 0.25},
+    "callback": {"sb3_cpm.ChallengerCallback": {"train_freq": 50}},
+    "buffer_size": 500,
+    "learning_starts": 50,
+    "batch_size": 8,
+    "train_freq": 10,
+}
+
+
+def tiny(folder: Path, **changes: Any) -> str:
+    """:return: a configuration for short runs; None removes an entry"""
+    path = folder / "tiny_sac.yml"
+    entry = {key: value for key, value in {**TINY, **changes}.items() if value is not None}
+    path.write_text(yaml.safe_dump({TOY: entry}))
+    return str(path)
+
+
+def run_tiny(folder: Path, n_timesteps: int, algo: str = "sac", **kwargs: Any) -> tuple[Any, Path]:
+    """:return: the model, and the run's folder"""
+    config = kwargs.pop("config", None) or tiny(folder)
+    arguments = {"config": config, "n_eval_episodes": 1, "save_replay_buffer": True, **kwargs}
+    manager = manager_of(algo, folder, n_timesteps, **arguments)
+    made = manager.setup_experiment()
+    assert made is not None
+    manager.learn(made[0])
+    manager.save_trained_model(made[0])
+    return made[0], Path(manager.save_path)
+
+
+@pytest.fixture(scope="module")
+def _stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_tiny(tmp_path_factory.mktemp("stopped"), 60, eval_freq=55)[1]
+
+
+@pytest.fixture
+def stopped(_stopped: Path, tmp_path: Path) -> Path:
+    """The folder of a run of 60 steps, as rl_zoo3 has left it, for a test of its own."""
+    return Path(shutil.copytree(_stopped, tmp_path / "stopped"))
+
+
+@pytest.mark.filterwarnings("ignore:The last trajectory")
+class TestGoingOn:
+    def test_the_buffer_takes_what_can_change_and_the_rest_is_told(
+        self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        agent = stopped / f"{TOY}.zip"
+        other = {"replay_buffer_kwargs": {"challenge_ratio": 0.0, "mix": "row", "max_challenges": 3}, "buffer_size": 900}
+        model, second = run_tiny(tmp_path, 10, trained_agent=str(agent), hyperparams=other)
+        printed = capsys.readouterr().out
+        buffer = model.replay_buffer
+        assert (buffer.challenge_ratio, buffer.mix, buffer.max_challenges, buffer.buffer_size) == (0.0, "row", 10, 500)
+        assert "challenge_ratio of the replay buffer is 0.0 from here on, it was 0.25" in printed
+        assert "WARNING: replay_buffer_kwargs max_challenges stays 10, not 3" in printed
+        assert "WARNING: buffer_size stays 500, not 900" in printed
+        # the next run is told what holds, not what was asked for
+        model, _ = run_tiny(tmp_path, 10, trained_agent=str(second / f"{TOY}.zip"), hyperparams=other)
+        printed = capsys.readouterr().out
+        assert "max_challenges stays 10, not 3" in printed and "buffer_size stays 500" in printed
+        assert "challenge_ratio of" not in printed
+
+    def test_an_unchanged_configuration_warns_of_nothing(
+        self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        run_tiny(tmp_path, 10, trained_agent=str(stopped / f"{TOY}.zip"), eval_freq=5)
+        printed = capsys.readouterr().out
+        assert "WARNING" not in printed and "newest" not in printed and "from here on" not in printed
+
+    def test_tensorboard_has_a_folder_for_every_run(self, stopped: Path, tmp_path: Path) -> None:
+        for run_id in (1, 2):
+            (tmp_path / "tb" / TOY / f"SAC_{run_id}").mkdir(parents=True)
+        run_tiny(tmp_path, 10, trained_agent=str(stopped / f"{TOY}.zip"), tensorboard_log=str(tmp_path / "tb"))
+        assert [path.parent.name for path in tmp_path.glob("tb/*/*/events*")] == ["SAC_3"]
+
+    def test_learning_starts_does_not_pile_up(self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        agent, config = stopped / f"{TOY}.zip", tiny(tmp_path, learning_starts=None)
+        for n_steps in (60, 120):
+            (agent.parent / "replay_buffer.pkl").unlink()
+            model, folder = run_tiny(tmp_path, 60, trained_agent=str(agent), config=config)
+            printed = capsys.readouterr().out
+            assert f"Going on at step {n_steps}" in printed and "the 50 random steps of learning_starts" in printed
+            assert model.learning_starts == 50 and model._n_updates > 0
+            agent = folder / f"{TOY}.zip"
+
+    @pytest.mark.filterwarnings("ignore:unclosed file.*replay_buffer:ResourceWarning")  # by SB3, if it cannot be read
+    def test_damaged_files_are_named(self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        agent = str(stopped / f"{TOY}.zip")
+        evaluations, buffer = stopped / "evaluations.npz", stopped / "replay_buffer.pkl"
+        evaluations.write_bytes(evaluations.read_bytes()[:300])
+        _, folder = run_tiny(tmp_path, 10, trained_agent=agent, eval_freq=5)
+        assert f"WARNING: {evaluations} cannot be read (BadZipFile" in capsys.readouterr().out
+        with np.load(folder / "evaluations.npz") as log:
+            assert log["timesteps"].tolist() == [65, 70]
+        for size in (3000, 0):
+            buffer.write_bytes(buffer.read_bytes()[:size])
+            with pytest.raises(ValueError, match=r"replay_buffer\.pkl is no complete replay buffer .* move it away"):
+                run_tiny(tmp_path, 10, trained_agent=agent)
+
+    def test_evaluations_of_other_lengths_are_told(
+        self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        agent = str(stopped / f"{TOY}.zip")
+        run_tiny(tmp_path, 5, trained_agent=agent, eval_freq=5, n_eval_episodes=2)
+        assert "evaluations.npz has evaluations of 1 episodes, now it is 2 (--eval-episodes)" in capsys.readouterr().out
+
+    def test_what_another_model_of_the_run_goes_on_with_is_told(
+        self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        run_tiny(tmp_path, 5, trained_agent=str(stopped / "best_model.zip"))
+        assert "best_model.zip is of step 55, and goes on with the run's newest challenger.pt and replay_buffer.pkl" in (
+            capsys.readouterr().out
+        )
+        saved = (stopped / "challenger.pt").rename(tmp_path / "other.pt")
+        config = tiny(tmp_path, callback={"sb3_cpm.ChallengerCallback": {"load_path": str(saved)}})
+        run_tiny(tmp_path, 5, trained_agent=str(stopped / f"{TOY}.zip"), config=config)
+        assert f"there is no challenger.pt in {stopped}: the challenger starts from {saved}" in capsys.readouterr().out
+
+    def test_dreamer_takes_other_rates(self, tmp_path: Path) -> None:
+        keys = ("n_timesteps", "policy", "env_kwargs", "buffer_size", "learning_starts", "train_freq")
+        entry = {key: TINY[key] for key in keys}
+        small = {"deter_size": 8, "hidden_size": 8, "vector_units": 8, "head_units": 8, "actor_units": 8, "critic_units": 8}
+        path = tmp_path / "dreamer.yml"
+
+        def run_dreamer(preset: dict[str, Any], **kwargs: Any) -> tuple[Any, Path]:
+            path.write_text(yaml.safe_dump({TOY: {**entry, "preset": {**small, **preset}}}))
+            return run_tiny(tmp_path, 60, algo="dreamer", config=str(path), **kwargs)
+
+        _, folder = run_dreamer({})
+        agent = str(folder / f"{TOY}.zip")
+        model, _ = run_dreamer({"model_lr": 5e-4, "horizon": 4}, trained_agent=agent)
+        assert model.challenger.preset["model_lr"] == model.lr_schedule(1.0) == 5e-4
+        assert model.challenger.preset["horizon"] == 4 and model.num_timesteps == 120
+        with pytest.raises(ValueError, match=r"cannot be loaded with \{'deter_size': 9\}"):
+            run_dreamer({"deter_size": 9}, trained_agent=agent)
+
+
+def test_the_missing_callback_is_told_in_the_words_of_a_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"a configuration of rl_zoo3 has the line `callback: sb3_cpm\.ChallengerCallback`"):
+        run_tiny(tmp_path, 10, config=tiny(tmp_path, callback=None))
+
+
 # ---------------------------------------------------------------------- our command
 def test_agents_stand_for_algorithm_and_file() -> None:
     path = str(config_folder() / "cpm_sac.yml")
@@ -589,6 +736,8 @@ def test_agents_stand_for_algorithm_and_file() -> None:
     assert complete("train", ["--env-kwargs", "a:'b=c'"]) == ["--env-kwargs", "a:'b=c'"]
     assert complete("train", ["--algo", "dreamer", "-conf", "my.yml"]) == ["--algo", "dreamer", "-conf", "my.yml"]
     assert complete("train", ["--algo", "sac"]) == ["--algo", "sac"]
+    for option in ("--conf", "--c", "-c", "-conf=my.yml", "--conf-file=my.yml"):  # argparse takes them all
+        assert str(config_folder() / "dreamer.yml") not in complete("train", ["--algo", "dreamer", option, "my.yml"]), option
 
 
 @pytest.fixture
@@ -604,6 +753,33 @@ def test_errors_of_our_command_are_sentences(capsys: pytest.CaptureFixture[str])
     assert main(["train", "--agent"]) == 1 and "--agent needs the name" in capsys.readouterr().err
     assert main(["train", "--agent", "sac", "--env", "CPM/PickCub-v1"]) == 1
     assert "CPM/PickCube-v1" in capsys.readouterr().err
+
+
+class Broken(gym.Env):
+    """Fails in the middle of a run, in code that is not ours."""
+
+    observation_space = spaces.Dict({"state": spaces.Box(-1, 1, (2,), np.float32)})
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        raise ValueError("cannot open gripper")
+
+
+@pytest.mark.usefixtures("_same_arguments")
+def test_errors_of_a_run_keep_their_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if "Broken-v0" not in gym.registry:
+        gym.register("Broken-v0", entry_point=Broken)
+    path = tmp_path / "my_sac.yml"
+    entry = {"n_timesteps": 5, "policy": "MultiInputPolicy"}
+    arguments = ["train", "--algo", "sac", "--env", "Broken-v0", "-f", str(tmp_path), "--device", "cpu", "--conf", str(path)]
+    path.write_text(yaml.safe_dump({"Broken-v0": entry}))
+    with pytest.raises(ValueError, match="cannot open gripper"):
+        main(arguments)
+    path.write_text(yaml.safe_dump({"Broken-v0": {**entry, "gama": 1}}))
+    assert main(arguments) == 1 and "unknown key 'gama'. Did you mean 'gamma'" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------- rl_zoo3's commands, from end to end
@@ -709,32 +885,3 @@ def test_optimize_and_train_with_a_trial(tmp_path: Path) -> None:
     values = dict(yaml.unsafe_load(saved))
     assert search.OURS not in values and {"challenge_ratio", "mix"} <= set(values["replay_buffer_kwargs"])
     assert "decay" in values["callback"][0]["sb3_cpm.ChallengerCallback"]
-    for option in ("--conf", "--c", "-c", "-conf=my.yml", "--conf-file=my.yml"):  # argparse takes them all
-        assert str(config_folder() / "dreamer.yml") not in complete("train", ["--algo", "dreamer", option, "my.yml"]), option
-class Broken(gym.Env):
-    """Fails in the middle of a run, in code that is not ours."""
-
-    observation_space = spaces.Dict({"state": spaces.Box(-1, 1, (2,), np.float32)})
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return self.observation_space.sample(), {}
-
-    def step(self, action: np.ndarray) -> Any:
-        raise ValueError("cannot open gripper")
-
-
-@pytest.mark.usefixtures("_same_arguments")
-def test_errors_of_a_run_keep_their_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if "Broken-v0" not in gym.registry:
-        gym.register("Broken-v0", entry_point=Broken)
-    path = tmp_path / "my_sac.yml"
-    entry = {"n_timesteps": 5, "policy": "MultiInputPolicy"}
-    arguments = ["train", "--algo", "sac", "--env", "Broken-v0", "-f", str(tmp_path), "--device", "cpu", "--conf", str(path)]
-    path.write_text(yaml.safe_dump({"Broken-v0": entry}))
-    with pytest.raises(ValueError, match="cannot open gripper"):
-        main(arguments)
-    path.write_text(yaml.safe_dump({"Broken-v0": {**entry, "gama": 1}}))
-    assert main(arguments) == 1 and "unknown key 'gama'. Did you mean 'gamma'" in capsys.readouterr().err
-
-

@@ -184,8 +184,9 @@ class CPMBuffer(EpisodeBuffer):
         if self.challenge_ratio > 0 and not self.has_challenger:
             raise ValueError(
                 f"CPMBuffer has challenge_ratio={self.challenge_ratio}, but nobody proposes challenges: pass "
-                "callback=ChallengerCallback() to learn(), or replay_buffer_kwargs=dict(challenge_ratio=0) to use the "
-                "buffer without challenges."
+                "callback=ChallengerCallback() to learn() (a configuration of rl_zoo3 has the line `callback: "
+                "sb3_cpm.ChallengerCallback`), or replay_buffer_kwargs=dict(challenge_ratio=0) to use the buffer without "
+                "challenges."
             )
         action = _executed(action, infos)
         if self.stopwatch is None:

@@ -5,7 +5,7 @@ The bridge to rl_zoo3. Importing it is all that rl_zoo3's commands need::
 
 =================  ================================================================================================
 ``registration``   ids of the tasks in gymnasium
-``bridge``         what is put into rl_zoo3: names, algorithms, search spaces (``search``), and three methods of its
+``bridge``         what is put into rl_zoo3: names, algorithms, search spaces (``search``), and four methods of its
                    experiment manager (``manager``) that check configurations (``checks``) and continue runs (``resume``)
 ``agents``         the same configurations as Python objects
 ``policies``       PPO's policies for point clouds and RGB-D

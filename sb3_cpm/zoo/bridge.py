@@ -6,7 +6,7 @@ What ``import sb3_cpm.zoo`` changes in rl_zoo3, all of it here and in the two mo
 * Our algorithms beside rl_zoo3's (:data:`ALGORITHMS`). ``--algo`` fixes its choices before it imports ``--gym-packages``, so
   only ``python -m sb3_cpm.zoo train`` can offer them.
 * Search spaces for ``--optimize``, see :mod:`sb3_cpm.zoo.search`.
-* Three methods of rl_zoo3's ``ExperimentManager``, see :mod:`sb3_cpm.zoo.manager`. They are replaced on the class, since
+* Four methods of rl_zoo3's ``ExperimentManager``, see :mod:`sb3_cpm.zoo.manager`. They are replaced on the class, since
   ``rl_zoo3.train`` holds the class before it imports ``--gym-packages``.
 """
 

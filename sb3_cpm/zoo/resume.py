@@ -6,10 +6,13 @@ tolerances and reward memory. We add ``challenger.pt``; beside a checkpoint ``rl
 ``rl_model_challenger_N_steps.pt``, and with ``--save-replay-buffer`` the buffer is brought up to date then too.
 
 rl_zoo3 starts ``-i`` at step 0, so it would repeat the random actions of ``learning_starts``; here the count goes on. The
-continued run has a folder of its own; its ``evaluations.npz`` begins with those of the run that it continues.
+continued run has a folder of its own; its ``evaluations.npz`` begins with those of the run that it continues. A buffer that is
+loaded takes the place of the one that was made after the configuration: what can be changed in it is, the rest is told.
 """
 
 import contextlib
+import inspect
+import pickle
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,10 +22,38 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.utils import get_latest_run_id
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.callbacks import ChallengerCallback
 
 CHALLENGER, BUFFER = "challenger.pt", "replay_buffer.pkl"
+
+#: Arguments of a CPMBuffer that one with transitions can change: it reads the attribute whenever it samples.
+LIVE = ("challenge_ratio", "demonstration_ratio", "mix", "terminal_goals", "refresh_every")
+
+
+@contextlib.contextmanager
+def loading(manager: Any, env: VecEnv) -> Iterator[None]:
+    """
+    Around ``ExperimentManager._load_pretrained_agent``: what pickle says of a damaged buffer names no file.
+
+    :param manager: rl_zoo3's ``ExperimentManager``
+    :param env: the training environments, closed if there will be no model to do so
+    :raises ValueError: if the buffer is not complete
+    """
+    try:
+        yield
+    except BaseException as error:
+        env.close()
+        if not isinstance(error, (pickle.UnpicklingError, EOFError)):
+            raise
+        path = Path(manager.trained_agent).with_name(BUFFER)
+        raise ValueError(
+            f"{path} is no complete replay buffer ({error}). It may have been cut off while it was written: put an earlier "
+            "one in its place, or move it away to go on with an empty buffer."
+        ) from error
 
 
 @contextlib.contextmanager
@@ -35,6 +66,7 @@ def kept(manager: Any, model: BaseAlgorithm) -> Iterator[Any]:
     :return: what to train in its place
     """
     folder = Path(manager.save_path)
+    learning_starts: Any = getattr(model, "learning_starts", None)
     challengers = [callback for callback in manager.callbacks if isinstance(callback, ChallengerCallback)]
     if manager.continue_training:
         _go_on(Path(manager.trained_agent), model, challengers)
@@ -46,6 +78,8 @@ def kept(manager: Any, model: BaseAlgorithm) -> Iterator[Any]:
     try:
         yield _Continued(model) if manager.continue_training else model
     finally:
+        if isinstance(model, OffPolicyAlgorithm):
+            model.learning_starts = learning_starts  # _go_on may have moved it, which the next run must not add to
         _save_challengers(folder / CHALLENGER, challengers)
 
 
@@ -63,7 +97,12 @@ class _Continued:
         return getattr(self._model, name)
 
     def learn(self, total_timesteps: int, **kwargs: Any) -> BaseAlgorithm:
-        """As SB3's, with ``reset_num_timesteps=False``."""
+        """As SB3's, with ``reset_num_timesteps=False``, and a folder of its own for TensorBoard."""
+        if self._model.tensorboard_log is not None:
+            # SB3 goes on in the newest folder there is, whosever that may be: let it be one of ours
+            name = inspect.signature(self._model.learn).parameters["tb_log_name"].default
+            run_id = get_latest_run_id(self._model.tensorboard_log, name) + 1
+            Path(self._model.tensorboard_log, f"{name}_{run_id}").mkdir(parents=True, exist_ok=True)
         return self._model.learn(total_timesteps, reset_num_timesteps=False, **kwargs)
 
 
@@ -114,18 +153,54 @@ def _go_on(trained_agent: Path, model: BaseAlgorithm, challengers: Sequence[Chal
     _say(f"Going on at step {model.num_timesteps}")
     saved = challenger_file(trained_agent)
     for callback in challengers:
-        if saved is None:
-            _say(f"WARNING: there is no {CHALLENGER} in {trained_agent.parent}: the challenger starts anew")
-        else:
+        if saved is not None:
             _say(f"Loading challenger {saved}")
             callback.load_path = saved
-    if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None and not _filled(model):
+        else:
+            start = "anew" if callback.load_path is None else f"from {callback.load_path}"
+            _say(f"WARNING: there is no {CHALLENGER} in {trained_agent.parent}: the challenger starts {start}")
+    if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
+        if _filled(model):
+            _update_buffer(trained_agent, model)
+        else:
+            _say(
+                f"WARNING: there is no {BUFFER} in {trained_agent.parent} (train with --save-replay-buffer): the buffer, its "
+                f"challenges and coefficients start empty, and the {model.learning_starts} random steps of learning_starts "
+                "are repeated to fill it"
+            )
+            model.learning_starts += model.num_timesteps
+    newest = [CHALLENGER] if challengers and saved == trained_agent.with_name(CHALLENGER) else []
+    if isinstance(model, OffPolicyAlgorithm) and _filled(model):
+        newest.append(BUFFER)
+    if newest and trained_agent.name.startswith(("best_model", "rl_model_")):
         _say(
-            f"WARNING: there is no {BUFFER} in {trained_agent.parent} (train with --save-replay-buffer): the buffer, its "
-            f"challenges and coefficients start empty, and the {model.learning_starts} random steps of learning_starts are "
-            "repeated to fill it"
+            f"{trained_agent.name} is of step {model.num_timesteps}, and goes on with the run's newest {' and '.join(newest)}"
         )
-        model.learning_starts += model.num_timesteps
+
+
+def _update_buffer(trained_agent: Path, model: OffPolicyAlgorithm) -> None:
+    """The loaded buffer does what the configuration says, as far as it can; the model knows what holds."""
+    buffer = model.replay_buffer
+    saved, _, _ = load_from_zip_file(trained_agent, device="cpu")
+    assert saved is not None and buffer is not None
+    before, now = saved["replay_buffer_kwargs"] or {}, dict(model.replay_buffer_kwargs or {})
+    defaults = {name: one.default for name, one in inspect.signature(type(buffer).__init__).parameters.items()}
+    fixed = {}
+    for name in sorted({*before, *now}):
+        was, wanted = before.get(name, defaults.get(name)), now.get(name, defaults.get(name))
+        if was == wanted:
+            continue
+        if name in LIVE and hasattr(buffer, name):
+            _say(f"{name} of the replay buffer is {wanted} from here on, it was {was}")
+            setattr(buffer, name, wanted)
+        else:
+            fixed[f"replay_buffer_kwargs {name}"] = was, wanted
+            now[name] = was
+    if model.buffer_size != saved["buffer_size"]:
+        fixed["buffer_size"] = saved["buffer_size"], model.buffer_size
+    model.replay_buffer_kwargs, model.buffer_size = now, saved["buffer_size"]
+    for name, (was, wanted) in fixed.items():
+        _say(f"WARNING: {name} stays {was}, not {wanted}: it is fixed in {trained_agent.with_name(BUFFER)}")
 
 
 def _remember_evaluations(trained_agent: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> None:
@@ -133,16 +208,28 @@ def _remember_evaluations(trained_agent: Path, model: BaseAlgorithm, callbacks: 
     path = trained_agent.with_name("evaluations.npz")
     if not path.is_file():
         return
-    with np.load(path) as log:
-        known = log["timesteps"] <= model.num_timesteps
-        past = {name: log[name][known].tolist() for name in log.files if len(log[name]) == len(known)}
+    try:
+        with path.open("rb") as file, np.load(file) as log:
+            known = log["timesteps"] <= model.num_timesteps
+            past = {name: log[name][known].tolist() for name in log.files if len(log[name]) == len(known)}
+        results, lengths = past["results"], past["ep_lengths"]
+    except Exception as error:  # of a file that is cut off, NumPy, zipfile and zlib each complain in their own way
+        _say(f"WARNING: {path} cannot be read ({type(error).__name__}: {error}): the evaluations before are left out")
+        return
     for callback in callbacks:
+        if not isinstance(callback, EvalCallback):
+            continue
         # a table: evaluations of other lengths do not fit into it
-        if isinstance(callback, EvalCallback) and all(len(row) == callback.n_eval_episodes for row in past["results"]):
-            callback.evaluations_timesteps += past["timesteps"]
-            callback.evaluations_results += past["results"]
-            callback.evaluations_length += past["ep_lengths"]
-            callback.evaluations_successes += past.get("successes", [])
+        if any(len(row) != callback.n_eval_episodes for row in results):
+            _say(
+                f"WARNING: {path} has evaluations of {len(results[0])} episodes, now it is {callback.n_eval_episodes} "
+                "(--eval-episodes): the evaluations before are left out"
+            )
+            continue
+        callback.evaluations_timesteps += past["timesteps"]
+        callback.evaluations_results += results
+        callback.evaluations_length += lengths
+        callback.evaluations_successes += past.get("successes", [])
 
 
 def _filled(model: OffPolicyAlgorithm) -> bool:
