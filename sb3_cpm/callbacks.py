@@ -8,7 +8,7 @@ environment, through which ``learn()`` takes its steps.
 import signal
 import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,10 +22,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
+from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer
 from sb3_cpm.buffers import CPMBuffer, Episode
-from sb3_cpm.challenger import Challenger
+from sb3_cpm.challenger import Challenger, choose_uncertainty
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
+from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
@@ -60,7 +62,8 @@ class ChallengerCallback(BaseCallback):
     :param load_path: a challenger saved by :meth:`save` to start from
     :param device: PyTorch device of the challenger; "auto": the model's
     :param verbose: 1 for messages
-    :raises ValueError: in ``learn()``, before any training, for models that this cannot work with
+    :raises ValueError: for arguments that cannot work, naming the nearest where one is misspelt; in ``learn()``, before any
+        training, for models that this cannot work with
     """
 
     def __init__(
@@ -81,14 +84,14 @@ class ChallengerCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
-        if train_freq < 1 or gradient_steps < 0:
-            raise ValueError(
-                f"train_freq must be at least 1 and gradient_steps at least 0, got {train_freq} and {gradient_steps}"
-            )
-        if unit not in ("step", "segment", "episode"):
-            raise ValueError(f'unit must be "step", "segment" or "episode", got {unit!r}')
-        if segment_length < 1:
-            raise ValueError(f"segment_length must be at least 1, got {segment_length}")
+        check("train_freq", train_freq, integer(1))
+        check("gradient_steps", gradient_steps, integer(0))
+        check("unit", unit, choice("step", "segment", "episode"))
+        check("segment_length", segment_length, integer(1))
+        check_arguments("decay_kwargs", decay_kwargs, make_decay, excluded=("decay",))
+        if challenger_kwargs is not None:
+            _check_challenger_kwargs(challenger_kwargs)
+        choose_uncertainty(uncertainty_class, uncertainty_kwargs, make_preset(preset, **(challenger_kwargs or {})))
         self.preset = preset
         self.keys = keys
         self.uncertainty_class = uncertainty_class
@@ -365,6 +368,13 @@ class ChallengerCallback(BaseCallback):
         state = self.__dict__.copy()
         state.update(_env=None, _previous_sigint=None)
         return state
+
+
+def _check_challenger_kwargs(given: Any) -> None:
+    for name in ("preset", "keys", "uncertainty_class", "uncertainty_kwargs", "device"):
+        if isinstance(given, Mapping) and name in given:
+            raise ValueError(f"challenger_kwargs are entries of the preset: give {name!r} to ChallengerCallback itself.")
+    check_names("challenger_kwargs", given, DEFAULT)
 
 
 def without_exploration(env: VecEnv | None) -> VecEnv:

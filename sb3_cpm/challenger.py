@@ -17,6 +17,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
+from sb3_cpm.arguments import check_arguments, nearest
 from sb3_cpm.presets import make_preset, plain
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
@@ -75,8 +76,9 @@ class Challenger:
         self.trained_updates = 0
 
         self.world_model = WorldModel(self.spec, self.action_dim, self.preset).to(self.device)
-        self.uncertainty_name, kind, defaults = self._uncertainty_class(uncertainty_class)
-        self.uncertainty_kwargs: dict[str, Any] = plain({**defaults, **(uncertainty_kwargs or {})})
+        self.uncertainty_name, kind, self.uncertainty_kwargs = choose_uncertainty(
+            uncertainty_class, uncertainty_kwargs, self.preset
+        )
         check_storable("uncertainty_kwargs", self.uncertainty_kwargs)
         model = self.world_model
         sizes = LatentSizes(
@@ -125,16 +127,6 @@ class Challenger:
         """The actor-critics that it has, "exploration" and "task"."""
         both = {"exploration": self._exploration, "task": self.task}
         return {name: behavior for name, behavior in both.items() if behavior is not None}
-
-    def _uncertainty_class(self, kind: str | type[Uncertainty]) -> tuple[str, type[Uncertainty], dict[str, Any]]:
-        """Its name in checkpoints, the class, and the preset's arguments for it."""
-        if isinstance(kind, str):
-            if kind not in UNCERTAINTY_CLASSES:
-                raise ValueError(f"Unknown uncertainty class {kind!r}, valid: {sorted(UNCERTAINTY_CLASSES)} or a class.")
-            return kind, UNCERTAINTY_CLASSES[kind], dict(self.preset["uncertainty"].get(kind, {}))
-        if not (isinstance(kind, type) and issubclass(kind, Uncertainty)):
-            raise ValueError(f"`uncertainty_class` must be a name or a subclass of Uncertainty, got {kind!r}.")
-        return f"{kind.__module__}.{kind.__qualname__}", kind, {}
 
     def _make_optimizers(self) -> dict[str, Optimizer]:
         common = {"eps": self.preset["adam_eps"], "clip": self.preset["grad_clip"]}
@@ -600,6 +592,30 @@ def _space(entry: Mapping[str, Any]) -> spaces.Box:
     if entry["image"]:
         return spaces.Box(0, 255, tuple(entry["shape"]), np.uint8)
     return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)
+
+
+def choose_uncertainty(
+    kind: str | type[Uncertainty], kwargs: Mapping[str, Any] | None, preset: Mapping[str, Any]
+) -> tuple[str, type[Uncertainty], dict[str, Any]]:
+    """
+    :param kind: ``uncertainty_class`` of :class:`Challenger`
+    :param kwargs: ``uncertainty_kwargs``
+    :param preset: a complete one
+    :return: its name in checkpoints, the class, and its arguments: the preset's with ``kwargs`` on top
+    :raises ValueError: for names that there are not, with the nearest
+    """
+    if isinstance(kind, str):
+        if kind not in UNCERTAINTY_CLASSES:
+            raise ValueError(
+                f"Unknown uncertainty class {kind!r}.{nearest(kind, UNCERTAINTY_CLASSES)} Valid: "
+                f"{sorted(UNCERTAINTY_CLASSES)} or a class."
+            )
+        # a class of one's own may take its arguments in any way
+        check_arguments("uncertainty_kwargs", kwargs, UNCERTAINTY_CLASSES[kind], excluded=("sizes",))
+        return kind, UNCERTAINTY_CLASSES[kind], plain({**preset["uncertainty"].get(kind, {}), **(kwargs or {})})
+    if not (isinstance(kind, type) and issubclass(kind, Uncertainty)):
+        raise ValueError(f"`uncertainty_class` must be a name or a subclass of Uncertainty, got {kind!r}.")
+    return f"{kind.__module__}.{kind.__qualname__}", kind, plain(dict(kwargs or {}))
 
 
 def choose_device(device: torch.device | str) -> torch.device:

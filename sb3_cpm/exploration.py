@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_cpm.arguments import ABOVE_0, SHARE, check, check_each, nearest
 from sb3_cpm.buffers import EXECUTED_ACTION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.stopwatch import Stopwatch
@@ -44,18 +45,19 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
     :param floor: epsilon that the decay goes to; the report wants it above zero [4.2]
     :param rate: steepness of exponential, inverse-time and logistic decay
     :return: the schedule
-    :raises ValueError: for an unknown name or probabilities outside [0, 1]
+    :raises ValueError: for an unknown name, with the nearest, and for values that cannot work
     """
     if callable(decay):
         return decay
-    if decay not in _DECAYS:
+    if not isinstance(decay, str) or decay not in _DECAYS:
         raise ValueError(
-            f"Unknown decay {decay!r}, choose one of {sorted(_DECAYS)} or pass a function of the remaining progress"
+            f"Unknown decay {decay!r}.{nearest(str(decay), _DECAYS)} Choose one of {sorted(_DECAYS)} or pass a function of "
+            "the remaining progress."
         )
-    if not (0 <= floor <= start <= 1):
+    check_each(SHARE, start=start, floor=floor)
+    check("rate", rate, ABOVE_0)
+    if floor > start:
         raise ValueError(f"A decay needs 0 <= floor <= start <= 1, got start={start}, floor={floor}")
-    if not rate > 0:
-        raise ValueError(f"rate must be positive, got {rate}")
     return _Decay(decay, start, floor, rate)
 
 

@@ -9,12 +9,23 @@ takes 4 on one core, nearly all of it for ten large heads that rate 800 x 15 ima
 differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
 """
 
-import difflib
-import math
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+
+from sb3_cpm.arguments import (
+    AT_LEAST_0,
+    SHARE,
+    Rule,
+    check,
+    check_arguments,
+    check_names,
+    choice,
+    integer,
+    nearest,
+    number,
+)
 
 REPORT: dict[str, Any] = {
     # what train() is fed with
@@ -129,46 +140,20 @@ CHALLENGES: dict[str, dict[str, Any]] = {
 }
 
 
-class _Rule(NamedTuple):
-    """What a preset entry must be, in words and as a test."""
-
-    words: str
-    holds: Callable[[Any], bool]
-
-
-def _integer(least: int) -> _Rule:
-    return _Rule(
-        f"an integer of at least {least}",
-        lambda value: isinstance(value, int) and not isinstance(value, bool) and value >= least,
-    )
-
-
-def _number(words: str, holds: Callable[[float], bool]) -> _Rule:
-    return _Rule(words, lambda value: isinstance(value, (int, float)) and not isinstance(value, bool) and holds(value))
-
-
-def _choice(*valid: Any) -> _Rule:
-    return _Rule(f"one of {valid}", lambda value: value in valid)
-
-
-_SHARE = _number("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)
-_AT_LEAST_0 = _number("a finite number of at least 0", lambda value: 0.0 <= value < math.inf)
-_ABOVE_0 = _number("a number above 0", lambda value: value > 0.0)
-_RULES: dict[str, _Rule] = {
-    **{key: _choice(True, False) for key, value in REPORT.items() if isinstance(value, bool)},
-    **{key: _integer(1) for key in REPORT if key.endswith(("_size", "_units", "_classes", "_every"))},
-    **{key: _integer(0) for key in REPORT if key.endswith("_layers")},  # an MLP may consist of its output layer
-    **{key: _integer(1) for key in ("cnn_depth", "cnn_layers", "horizon")},
-    **{key: _AT_LEAST_0 for key in REPORT if key.endswith(("_lr", "_scale"))},
-    "sequence_length": _integer(2),  # a transition has two rows
-    "imagination_starts": _Rule(f"None or {_integer(1).words}", lambda value: value is None or _integer(1).holds(value)),
-    "latent": _choice("gaussian", "categorical"),
-    "actor_gradient": _choice("dynamics", "reinforce", "both"),
-    **{key: _SHARE for key in ("gamma", "lambda_", "kl_balance", "reinforce_share", "weight_decay")},
-    "free_nats": _AT_LEAST_0,
-    "adam_eps": _ABOVE_0,
-    "grad_clip": _ABOVE_0,
-    "uncertainty": _Rule(
+_RULES: dict[str, Rule] = {
+    **{key: choice(True, False) for key, value in REPORT.items() if isinstance(value, bool)},
+    **{key: integer(1) for key in REPORT if key.endswith(("_size", "_units", "_classes", "_every"))},
+    **{key: integer(0) for key in REPORT if key.endswith("_layers")},  # an MLP may consist of its output layer
+    **{key: integer(1) for key in ("cnn_depth", "cnn_layers", "horizon")},
+    **{key: AT_LEAST_0 for key in REPORT if key.endswith(("_lr", "_scale"))},
+    "sequence_length": integer(2),  # a transition has two rows
+    "imagination_starts": Rule(f"None or {integer(1).words}", lambda value: value is None or integer(1).holds(value)),
+    "latent": choice("gaussian", "categorical"),
+    "actor_gradient": choice("dynamics", "reinforce", "both"),
+    **{key: SHARE for key in ("gamma", "lambda_", "kl_balance", "reinforce_share", "weight_decay")},
+    "free_nats": AT_LEAST_0,
+    **{key: number("a number above 0", lambda value: value > 0.0) for key in ("adam_eps", "grad_clip")},
+    "uncertainty": Rule(
         "a dict of dicts of arguments, by the name of the uncertainty class",
         lambda value: isinstance(value, dict) and all(isinstance(one, dict) for one in value.values()),
     ),
@@ -197,9 +182,20 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
             raise ValueError(f"Unknown preset entry {key!r}.{nearest(key, result, cutoff=0.0)} Valid: {sorted(result)}.")
     result = plain({**result, **overrides})
     for key, rule in _RULES.items():
-        if not rule.holds(result[key]):
-            raise ValueError(f"Preset entry {key!r} must be {rule.words}, got {result[key]!r}.")
+        check(f"Preset entry {key!r}", result[key], rule)
+    if "uncertainty" in overrides:
+        _check_uncertainty(result["uncertainty"])
     return result
+
+
+def _check_uncertainty(arguments: Mapping[str, Mapping[str, Any]]) -> None:
+    from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES  # torch, which plain data can do without
+
+    where = "Preset entry 'uncertainty'"
+    ours = {name: kwargs for name, kwargs in arguments.items() if "." not in name}  # others have their module in their name
+    check_names(where, ours, UNCERTAINTY_CLASSES)
+    for name, kwargs in ours.items():
+        check_arguments(f"{where}, {name}", kwargs, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
 
 
 def plain(value: Any) -> Any:
@@ -214,9 +210,3 @@ def plain(value: Any) -> Any:
     if type(value) in (list, tuple):
         return type(value)(plain(one) for one in value)
     return value
-
-
-def nearest(name: str, valid: Iterable[str], cutoff: float = 0.4) -> str:
-    """:return: a sentence with the most similar name, "" where nothing is; ``cutoff`` 0 always finds one"""
-    matches = difflib.get_close_matches(name, list(valid), n=1, cutoff=cutoff)
-    return f" Did you mean {matches[0]!r}?" if matches else ""

@@ -369,7 +369,8 @@ def test_an_uncertainty_class_of_ones_own_has_to_be_named_when_loading(tmp_path:
         (spaces.Dict({"d": spaces.Discrete(3)}), box(2), {}, "No observation key is usable"),
         (VECTOR, box(2), {"horizn": 3}, "Did you mean 'horizon'"),
         (VECTOR, box(2), {"latent": "uniform"}, "'latent' must be"),
-        (VECTOR, box(2), {"uncertainty_class": "rnd2"}, "Unknown uncertainty class"),
+        (VECTOR, box(2), {"uncertainty_class": "rnd2"}, "Unknown uncertainty class 'rnd2'. Did you mean 'rnd'"),
+        (VECTOR, box(2), {"uncertainty_kwargs": {"head": 3}}, "uncertainty_kwargs: .*Did you mean 'heads'"),
         (VECTOR, box(2), {"uncertainty_class": int}, "subclass of Uncertainty"),
     ],
 )

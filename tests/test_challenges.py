@@ -50,7 +50,14 @@ def test_unusable_statistics_leave_the_coefficient_alone(values, reference):
 
 @pytest.mark.parametrize(
     "kwargs",
-    [dict(low=0.9, high=1.1, factor=1.2), dict(low=1.1, high=1.0), dict(factor=1.0), dict(low=0.0), dict(initial=0.0)],
+    [
+        dict(low=0.9, high=1.1, factor=1.2),
+        dict(low=1.1, high=1.0),
+        dict(factor=1.0),
+        dict(low=0.0),
+        dict(initial=0.0),
+        dict(high="x"),
+    ],
 )
 def test_settings_that_cannot_settle_are_refused(kwargs):
     with pytest.raises(ValueError):
@@ -181,6 +188,8 @@ def test_a_tolerance_that_always_rejects_stays_finite():
         dict(target_acceptance=1.0),
         dict(novelty_tolerance=-1),
         dict(reward_memory_decay=1.0),
+        dict(relevance_tolerance="8"),
+        dict(target_acceptance="half"),
     ],
 )
 def test_filter_arguments(kwargs):
@@ -189,6 +198,14 @@ def test_filter_arguments(kwargs):
 
 
 # ---------------------------------------------------------------------- artificial reward R
+
+
+@pytest.mark.parametrize("name", ["scale", "exploration_ratio", "embedding_ratio", "step_ratio"])
+@pytest.mark.parametrize("value", [-1, 0, np.nan, np.inf, "large", True])
+def test_rewards_that_would_teach_something_else_are_refused(name, value):
+    """A negative scale turns every reward around, and nothing else would tell."""
+    with pytest.raises(ValueError, match=f"{name} must be a finite number above 0"):
+        ArtificialReward(**{name: value})
 
 
 def test_embedding_progress_by_hand():

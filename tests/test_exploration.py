@@ -40,7 +40,16 @@ def test_decays_by_hand():
 
 
 @pytest.mark.parametrize(
-    "kwargs", [dict(decay="expo"), dict(start=1.2), dict(floor=-0.1), dict(start=0.1, floor=0.2), dict(rate=0.0)]
+    "kwargs",
+    [
+        dict(decay="expo"),
+        dict(start=1.2),
+        dict(floor=-0.1),
+        dict(start=0.1, floor=0.2),
+        dict(rate=0.0),
+        dict(rate="fast"),
+        dict(decay=["linear"]),
+    ],
 )
 def test_bad_decays(kwargs):
     with pytest.raises(ValueError):

@@ -70,9 +70,12 @@ def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.Cap
             "env_kwargs: CPMToy-v0 takes no 'keyss'. Did you mean 'keys'? Valid: keys, n_points",
         ),
         (["--buffer-kwargs", "mixx=row"], "buffer_kwargs: unknown name 'mixx'. Did you mean 'mix'?"),
-        (["--buffer-kwargs", "filter_kwargs={widht: 1}"], "buffer_kwargs: unknown name 'widht'"),
+        (["--buffer-kwargs", "filter_kwargs={widht: 1}"], "filter_kwargs: unknown key 'widht'"),
         (["--callback-kwargs", "train_frek=1"], "callback_kwargs: unknown name 'train_frek'. Did you mean 'train_freq'?"),
-        (["--callback-kwargs", "uncertainty_kwargs={metrik: log}"], "callback_kwargs: unknown name 'metrik'"),
+        (
+            ["--callback-kwargs", "uncertainty_kwargs={metrik: log}"],
+            "uncertainty_kwargs: unknown key 'metrik'. Did you mean 'metric'?",
+        ),
         (["--steps", "40"], "steps=40 is no longer than learning_starts=50"),
     ],
 )

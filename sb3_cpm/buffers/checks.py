@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_cpm.arguments import SHARE, check, check_each, integer
+
 
 def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_keys: Sequence[str] | None) -> None:
     """:raises ValueError: for observations that a buffer cannot hold, or that lack what its arguments ask for"""
@@ -39,25 +41,28 @@ def check_arguments(
 ) -> None:
     """:raises ValueError: for arguments of CPMBuffer that cannot work"""
     check_spaces(observation_space, 0, None)
-    for name, share in (("challenge_ratio", challenge_ratio), ("demonstration_ratio", demonstration_ratio)):
-        if not 0 <= share <= 1:
-            raise ValueError(f"{name} is a share of the batches and must lie in [0, 1], got {share}")
-    # 0.1 is the default and means nothing without demonstrations
-    if demonstration_ratio != 0.1:
-        check_shares(challenge_ratio, demonstration_ratio)
+    check_values(challenge_ratio, demonstration_ratio, mix, max_challenges, refresh_every)
     if challenge_ratio > 0 and not isinstance(action_space, spaces.Box):
         raise ValueError(
             f"Challenges need continuous actions (a Box action space), got {action_space}. Use SAC, TD3, DDPG or TQC on a "
             "continuous environment, or challenge_ratio=0 to use the buffer without challenges."
         )
+
+
+def check_values(
+    challenge_ratio: float, demonstration_ratio: float, mix: str, max_challenges: int, refresh_every: int | None
+) -> None:
+    """:raises ValueError: for arguments of CPMBuffer that cannot work whatever the spaces are"""
+    share = SHARE._replace(words="a share of the batches, a number in [0, 1]")
+    check_each(share, challenge_ratio=challenge_ratio, demonstration_ratio=demonstration_ratio)
+    # 0.1 is the default and means nothing without demonstrations
+    if demonstration_ratio != 0.1:
+        check_shares(challenge_ratio, demonstration_ratio)
     if mix not in ("batch", "row"):
         raise ValueError(f'mix must be "batch" or "row", got {mix!r}')
-    if max_challenges < 1:
-        raise ValueError(f"max_challenges must be at least 1, got {max_challenges}; use challenge_ratio=0 for none")
-    if refresh_every is not None and refresh_every < 1:
-        raise ValueError(
-            f"refresh_every is a number of transitions and must be at least 1, or None for never, got {refresh_every}"
-        )
+    check("max_challenges", max_challenges, integer(1)._replace(words="an integer of at least 1 (none: challenge_ratio=0)"))
+    if refresh_every is not None:
+        check("refresh_every", refresh_every, integer(1)._replace(words="None or a number of transitions, at least 1"))
 
 
 def check_shares(challenge_ratio: float, demonstration_ratio: float) -> None:

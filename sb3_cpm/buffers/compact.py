@@ -6,7 +6,7 @@ numbers before they became floats. Storing them as what they are quarters their 
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -188,7 +188,9 @@ def make_codecs(
     :return: a codec per key
     :raises ValueError: for keys that there are not and storage that would destroy the observations
     """
-    specs = specs or {}
+    specs = {} if specs is None else specs
+    if not isinstance(specs, Mapping):
+        raise ValueError(f'storage_dtypes must say how each key is stored, {{"pointcloud": "float16"}}, got {specs!r}')
     unknown = set(specs) - set(shapes)
     if unknown:
         raise ValueError(f"storage_dtypes {sorted(unknown)} are not among the observation keys {sorted(shapes)}")

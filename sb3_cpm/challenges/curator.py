@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from sb3_cpm.arguments import ABOVE_0, check, check_arguments, check_each, integer, told_where
 from sb3_cpm.challenges.filters import CandidateStatistics, ChallengeFilter
 from sb3_cpm.challenges.quality import ChallengeQuality, best_goal
 from sb3_cpm.challenges.rewards import ArtificialReward, ArtificialRewards
+from sb3_cpm.challenges.targeting import DynamicCoefficient
 from sb3_cpm.type_aliases import Evaluation
 
 
@@ -58,6 +60,7 @@ class ChallengeCurator:
     :param filter_kwargs: passed to :class:`~sb3_cpm.challenges.filters.ChallengeFilter`
     :param reward_kwargs: passed to :class:`~sb3_cpm.challenges.rewards.ArtificialReward`
     :param coefficient_kwargs: passed to every :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
+    :raises ValueError: for arguments that cannot work, naming the nearest where one is misspelt
     """
 
     def __init__(
@@ -69,12 +72,18 @@ class ChallengeCurator:
         reward_kwargs: dict[str, Any] | None = None,
         coefficient_kwargs: dict[str, Any] | None = None,
     ):
-        if warmup_steps < 0:
-            raise ValueError(f"warmup_steps must not be negative, got {warmup_steps}")
+        check("warmup_steps", warmup_steps, integer(0))
+        check_each(ABOVE_0, kl_ratio=kl_ratio, reward_ratio=reward_ratio)
+        check_arguments("filter_kwargs", filter_kwargs, ChallengeFilter, excluded=("reward_ratio",))
+        check_arguments("reward_kwargs", reward_kwargs, ArtificialReward, excluded=("coefficient_kwargs",))
+        check_arguments("coefficient_kwargs", coefficient_kwargs, DynamicCoefficient, excluded=("target_ratio",))
         self.warmup_steps = warmup_steps
-        self.quality = ChallengeQuality(kl_ratio, reward_ratio, coefficient_kwargs)
-        self.filter = ChallengeFilter(reward_ratio, **(filter_kwargs or {}))
-        self.reward = ArtificialReward(coefficient_kwargs=coefficient_kwargs, **(reward_kwargs or {}))
+        with told_where("coefficient_kwargs"):
+            self.quality = ChallengeQuality(kl_ratio, reward_ratio, coefficient_kwargs)
+        with told_where("filter_kwargs"):
+            self.filter = ChallengeFilter(reward_ratio, **(filter_kwargs or {}))
+        with told_where("reward_kwargs"):
+            self.reward = ArtificialReward(coefficient_kwargs=coefficient_kwargs, **(reward_kwargs or {}))
 
     def propose(self, rewards: np.ndarray, evaluation: Evaluation) -> Proposal | None:
         """

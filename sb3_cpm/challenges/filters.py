@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_cpm.arguments import ABOVE_0, SHARE, check_each
+
 #: The criteria in the report's order, F1 to F5.
 CRITERIA = ("novel", "relevant", "highlight", "sane", "not_first")
 
@@ -80,6 +82,7 @@ class ChallengeFilter:
     :param gamma: strictness factor of all three tolerances
     :param target_acceptance: share of candidates that each of F1 to F3 accepts once settled
     :param reward_memory_decay: gamma_r of the mean reward memory, report: 0.99
+    :raises ValueError: for settings that cannot work
     """
 
     def __init__(
@@ -92,7 +95,15 @@ class ChallengeFilter:
         target_acceptance: float = 0.5,
         reward_memory_decay: float = 0.99,
     ):
-        if not 0 <= reward_memory_decay < 1:
+        check_each(
+            ABOVE_0,
+            novelty_tolerance=novelty_tolerance,
+            relevance_tolerance=relevance_tolerance,
+            highlight_tolerance=highlight_tolerance,
+            gamma=gamma,
+        )
+        check_each(SHARE, target_acceptance=target_acceptance, reward_memory_decay=reward_memory_decay)
+        if reward_memory_decay == 1:
             raise ValueError(f"reward_memory_decay must lie in [0, 1), got {reward_memory_decay}")
         self.reward_ratio = reward_ratio
         self.w1 = Tolerance(novelty_tolerance, looser=+1, gamma=gamma, target_acceptance=target_acceptance)

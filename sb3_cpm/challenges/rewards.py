@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_cpm.arguments import ABOVE_0, check_each
 from sb3_cpm.challenges.targeting import DynamicCoefficient
 
 #: The terms of an artificial reward, attributes of :class:`ArtificialRewards`.
@@ -43,6 +44,7 @@ class ArtificialReward:
     :param step_ratio: target of mean(c_step * d_step) over mean(c_expl * u), report: 0.3
     :param scale: factor of the whole sum, report: 0.5
     :param coefficient_kwargs: passed to each :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
+    :raises ValueError: for a ratio or scale that is no finite number above 0
     """
 
     def __init__(
@@ -53,6 +55,9 @@ class ArtificialReward:
         scale: float = 0.5,
         coefficient_kwargs: dict[str, Any] | None = None,
     ):
+        check_each(
+            ABOVE_0, exploration_ratio=exploration_ratio, embedding_ratio=embedding_ratio, step_ratio=step_ratio, scale=scale
+        )
         kwargs = coefficient_kwargs or {}
         self.scale = scale
         self.c_expl = DynamicCoefficient(exploration_ratio, **kwargs)

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_cpm.arguments import ABOVE_0, check_each
+
 #: Coefficients stay within these bounds whatever the statistics do.
 MIN_COEFFICIENT, MAX_COEFFICIENT = 1e-8, 1e8
 
@@ -44,11 +46,10 @@ class DynamicCoefficient:
         initial: float = 1.0,
         calibrate: bool = True,
     ):
-        if not (np.isfinite(target_ratio) and target_ratio > 0):
-            raise ValueError(f"target_ratio must be a positive number, got {target_ratio}")
+        check_each(ABOVE_0, target_ratio=target_ratio, low=low, high=high, factor=factor, initial=initial)
         if not factor > 1:
             raise ValueError(f"factor (lambda) must be greater than 1, got {factor}; the report uses 1.1 to 1.5")
-        if not 0 < low < high:
+        if not low < high:
             raise ValueError(f"Tolerances must satisfy 0 < low < high, got low={low}, high={high}")
         if not low * factor < high / factor:
             raise ValueError(

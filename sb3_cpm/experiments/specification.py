@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sb3_cpm.presets import nearest
+from sb3_cpm.arguments import nearest
 from sb3_cpm.run.evaluation import FIRST_SEED
 
 #: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.

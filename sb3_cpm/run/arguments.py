@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
-from sb3_cpm.presets import nearest
+from sb3_cpm.arguments import nearest
 
 
 def check_arguments(setting: str, given: Mapping[str, Any], taker: Callable[..., Any], excluded: Collection[str] = ()) -> None:

@@ -14,9 +14,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm.arguments import nearest
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
 from sb3_cpm.envs.wrappers import DictObservation
-from sb3_cpm.presets import nearest
 from sb3_cpm.run.arguments import unexpected_argument
 
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cpm.presets import nearest
+from sb3_cpm.arguments import nearest
 from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
 from sb3_cpm.zoo.registration import register_robotics
 
