@@ -196,7 +196,9 @@ class _ThriftyCritic(ContinuousCritic):
 
 class PointNetPolicy(MultiInputPolicy):
     """
-    SAC's ``MultiInputPolicy`` with :class:`PointNetExtractor` as the default extractor; all arguments as in SB3.
+    SAC's ``MultiInputPolicy`` with :class:`PointNetExtractor` as the default extractor; all arguments as in SB3. TD3, DDPG and
+    TQC have policies of their own: give them ``"MultiInputPolicy"`` and
+    ``policy_kwargs=dict(features_extractor_class=PointNetExtractor)``.
 
     Actor and critic have an extractor each (SB3's default as well): SB3 trains a shared one by the actor's loss alone, a
     weak signal for something as large as a PointNet, and thanks to the critical points sharing would save little.

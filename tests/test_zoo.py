@@ -29,6 +29,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from sb3_cpm import ChallengerCallback, CPMBuffer
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
+from sb3_cpm.extractors import PointNetExtractor
 from sb3_cpm.presets import CHALLENGES
 from sb3_cpm.zoo import ENV_IDS, TASKS, env_id_of, search
 from sb3_cpm.zoo.__main__ import complete, main
@@ -224,6 +225,29 @@ def edited(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
         ({"replay_buffer_kwargs": {"challange_ratio": 0.1}}, "replay_buffer_kwargs: .*Did you mean 'challenge_ratio'"),
         ({"policy_kwargs": {"net_arhc": [3]}}, "policy_kwargs: .*Did you mean 'net_arch'"),
         ({"callback": {"sb3_cpm.ChallengerCallback": {"trainfreq": 1}}}, "ChallengerCallback: .*Did you mean 'train_freq'"),
+        ({"replay_buffer_kwargs": "dict(challange_ratio=0.1)"}, "replay_buffer_kwargs: .*Did you mean 'challenge_ratio'"),
+        ({"replay_buffer_kwargs": {"device": "cpu"}}, "replay_buffer_kwargs: 'device' is set elsewhere"),
+        (
+            {"replay_buffer_kwargs": {"reward_kwargs": {"scal": 1}}},
+            "replay_buffer_kwargs: reward_kwargs: .*Did you mean 'scale'",
+        ),
+        ({"replay_buffer_kwargs": {"challenge_ratio": "quarter"}}, "challenge_ratio must be .* got 'quarter'"),
+        ({"replay_buffer_class": "CPMHerReplayBufer"}, "cannot evaluate .*Did you mean 'CPMHerReplayBuffer'"),
+        ({"policy_kwargs": "dict(net_arhc=[3])"}, "policy_kwargs: .*Did you mean 'net_arch'"),
+        ({"policy_kwargs": "dict(net_arch=[3]"}, r"policy_kwargs: Python cannot evaluate 'dict\(net_arch=\[3\]'"),
+        ({"policy_kwargs": {"features_extractor_kwargs": {"state_ach": [3]}}}, "Did you mean 'state_arch'"),
+        (
+            {"policy_kwargs": {"features_extractor_class": "sb3_cpm.PointNetExtractor"}},
+            r'must be a class, .* in quotes: "dict\(features_extractor_class=PointNetExtractor\)"',
+        ),
+        ({"callback": {"sb3_cpm.ChallengerCallback": {"preset": "defalt"}}}, "ChallengerCallback: .*Did you mean 'default'"),
+        ({"callback": {"sb3_cpm.ChallengerCallback": {"preset": {"horizn": 3}}}}, "Did you mean 'horizon'"),
+        ({"callback": {"sb3_cpm.ChallengerCallback": {"decay_kwargs": {"strat": 0.9}}}}, "Did you mean 'start'"),
+        ({"callback": {"sb3_cpm.ChallengerCallback": None}}, "must be a mapping, got None: write {} for none"),
+        ({"callback": {"ChallengerCallback": {}}}, "'ChallengerCallback' must begin with its module"),
+        ({"policy": "MultiInputPolcy"}, "sac has no policy 'MultiInputPolcy'. Did you mean 'MultiInputPolicy'"),
+        ({"policy": "sb3_cpm.PointNetPolcy"}, "sb3_cpm has no 'PointNetPolcy'. Did you mean 'PointNetPolicy'"),
+        ({"env_kwargs": {"n_point": 3}}, "env_kwargs: unknown key 'n_point'. Did you mean 'n_points'"),
         ({"callback": "sb3_cpm.ChalengerCallback"}, "sb3_cpm has no 'ChalengerCallback'. Did you mean 'ChallengerCallback'"),
         ({"callback": "sb3_cmp.ChallengerCallback"}, "cannot import 'sb3_cmp.ChallengerCallback'"),
         ({"env_wrapper": {"sb3_cpm.zoo.wrappers.RGBD": {"max_dept": 1}}}, "RGBD: .*Did you mean 'max_depth'"),
@@ -249,13 +273,13 @@ def test_misspelt_environments_name_the_nearest(tmp_path: Path) -> None:
         load_agent("sac", "CPM/PickCub-v1")
     path = tmp_path / "my_sac.yml"
     entry = read_entries(config_folder() / "sac.yml")["default"]
-    for wrong, asked, message in (
-        ("CPM/PickCub-v1", "CPM/PickCube-v1", "no environment 'CPM/PickCub-v1'. Did you mean 'CPM/PickCube-v1'"),
-        ("MountainCarContinous-v0", "MountainCarContinuous-v0", "did you mean 'MountainCarContinuous-v0'"),
-    ):
-        path.write_text(yaml.safe_dump({wrong: entry, "default": entry}))
-        with pytest.raises(ValueError, match=message):
-            load_agent(path, asked)
+    path.write_text(yaml.safe_dump({"CPM/PickCub-v1": entry, "default": entry}))
+    with pytest.raises(ValueError, match="no environment 'CPM/PickCub-v1'. Did you mean 'CPM/PickCube-v1'"):
+        load_agent(path, "CPM/PickCube-v1")
+    # it may be another package's: there is no knowing, so the one that was asked for is not refused
+    path.write_text(yaml.safe_dump({"MountainCarContinous-v0": entry, "default": {**entry, "gamma": 0.5}}))
+    with pytest.warns(UserWarning, match="gets the default.*did you mean 'MountainCarContinuous-v0'"):
+        assert load_agent(path, "MountainCarContinuous-v0").hyperparameters["gamma"] == 0.5
     path.write_text(yaml.safe_dump({TOY: entry}))
     with pytest.raises(ValueError, match="neither an entry 'Pendulum-v1' nor a default"):
         load_agent(path, "Pendulum-v1")
@@ -272,6 +296,40 @@ def test_files_that_are_no_configurations(text: str, message: str, tmp_path: Pat
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         load_agent(path, TOY)
+
+
+@pytest.mark.parametrize(
+    "name, changes, message",
+    [
+        ("dreamer", {"preset": "defalt"}, "Did you mean 'default'"),
+        ("dreamer", {"preset": {"uncertainty": {"plan2explor": {}}}}, "Did you mean 'plan2explore'"),
+        ("dreamer", {"replay_buffer_kwargs": {"memap_dir": "d"}}, "replay_buffer_kwargs: .*Did you mean 'memmap_dir'"),
+        ("plan2explore", {"uncertainty_class": "rmd"}, "Did you mean 'rnd'"),
+        ("plan2explore", {"uncertainty_kwargs": {"head": 3}}, "uncertainty_kwargs: .*Did you mean 'heads'"),
+        ("ppo_pointcloud", {"policy_kwargs": {"features_extractor_kwargs": {"size": 3}}}, "Did you mean 'sizes'"),
+    ],
+)
+def test_misspelt_keys_of_other_algorithms(name: str, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_agent(name, TOY, changes)
+    explored = {
+        "start_from": "explorer.zip",
+        "uncertainty_kwargs": {"inputs": "stoch"},
+    }  # of its class, which is not known yet
+    assert load_agent("plan2explore", TOY, explored).algo == "plan2explore"
+
+
+@pytest.mark.parametrize("algo", ["td3", "ddpg", "tqc"])
+def test_policies_of_other_algorithms_are_refused(algo: str, tmp_path: Path) -> None:
+    entry = read_entries(config_folder() / "cpm_sac.yml")["default"]
+    path = tmp_path / f"my_{algo}.yml"
+    path.write_text(yaml.safe_dump({"default": {key: value for key, value in entry.items() if key != "ent_coef"}}))
+    with pytest.raises(ValueError, match=f"PointNetPolicy is a policy of sac, not of {algo}.*take policy: MultiInputPolicy"):
+        load_agent(path, TOY)
+    advised = {"policy": "MultiInputPolicy", "policy_kwargs": "dict(features_extractor_class=PointNetExtractor)"}
+    built = load_agent(path, TOY, advised).build(0, device="cpu")
+    assert isinstance(built.model.policy.actor.features_extractor, PointNetExtractor)
+    built.env.close()
 
 
 def test_arguments_of_our_tasks_are_checked() -> None:

@@ -2,13 +2,15 @@
 Misspelt keys in a configuration, found before anything is built and told with the nearest that exists.
 
 rl_zoo3 hands everything that it does not know to constructors: a misspelt key is a TypeError after the environments are
-made, with ``-i`` nothing at all. What is checked: the keys of an entry; arguments of callbacks, wrappers, replay buffer and
-policy as far as they are written as mappings; ``env_kwargs`` of our tasks; and names of environments that do not exist.
+made, with ``-i`` nothing at all. What is checked: the keys of an entry; arguments of callbacks, wrappers, replay buffer,
+policy and features extractor, and those within ours (presets, uncertainty, decay, challenges); ``env_kwargs`` of our tasks;
+and names of environments that do not exist.
 """
 
 import difflib
 import importlib
 import inspect
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,17 @@ from typing import Any
 import gymnasium as gym
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_cpm.presets import nearest
+from sb3_cpm.arguments import argument_names, check_arguments, check_names, nearest, told_where
+from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.buffers.checks import check_values
+from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.challenger import choose_uncertainty
+from sb3_cpm.challenges import ChallengeCurator
+from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
+from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.presets import make_preset
 from sb3_cpm.zoo.registration import ENV_IDS, NAMESPACE
 
 #: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
@@ -34,6 +45,10 @@ ZOO_KEYS = (
     "noise_type",
     "noise_std",
 )
+
+#: Arguments that algorithms give to replay buffers and policies themselves.
+SET_FOR_BUFFERS = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
+SET_FOR_POLICIES = ("observation_space", "action_space", "lr_schedule")
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
@@ -65,8 +80,7 @@ def check_environment_names(config: str, env_id: str) -> None:
     """
     :param config: what rl_zoo3 was given as ``--conf-file``; only YAML files are looked at
     :param env_id: the environment that is asked for
-    :raises ValueError: see :func:`read_entries`; and if the environment is not in the file, there is no default for it, or the
-        name is so close to one that is there that one of them must be a slip
+    :raises ValueError: see :func:`read_entries`; and if the environment is not in the file and there is no default for it
     """
     path = Path(config)
     if path.suffix not in (".yml", ".yaml"):
@@ -88,20 +102,24 @@ def find_entry(entries: Mapping[str, Any], env_id: str, path: Path) -> dict[str,
         others = ", ".join(map(repr, entries))
         raise ValueError(f"{path} has neither an entry {env_id!r} nor a default.{nearest(env_id, entries)} It has {others}.")
     if env_id not in entries:
-        _refuse_slip(env_id, entries, path)
+        _warn_of_slip(env_id, entries, path)
     found = entries.get(env_id, entries.get("default", entries.get("atari")))
     if not isinstance(found, dict):
         raise ValueError(f"{path}: the entry of {env_id} must be a mapping of hyperparameters, got {found!r}.")
     return found
 
 
-def _refuse_slip(env_id: str, entries: Iterable[str], path: Path) -> None:
-    """A misspelt name in a file would be passed over for the default without a word; another version's would not be a slip."""
+def _warn_of_slip(env_id: str, entries: Iterable[str], path: Path) -> None:
+    """A misspelt name in a file is passed over for the default without a word; another version's would not be a slip."""
     name = env_id.rpartition("-v")[0]
     others = {other.rpartition("-v")[0]: other for other in map(str, entries) if other not in gym.registry}
     matches = difflib.get_close_matches(name, [other for other in others if other != name], n=1, cutoff=0.9)
-    if matches:
-        raise ValueError(f"{path} has an entry {others[matches[0]]!r}, which is no environment: did you mean {env_id!r}?")
+    if matches:  # no error: the entry may belong to a package that is not imported here
+        warnings.warn(
+            f"{path} has no entry for {env_id!r}, which gets the default. Its entry {others[matches[0]]!r} names no "
+            f"environment that is registered: did you mean {env_id!r}?",
+            stacklevel=4,
+        )
 
 
 def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id: str, path: str | Path) -> None:
@@ -110,27 +128,27 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     :param algo: rl_zoo3's name of the algorithm
     :param env_id: the environment that is asked for
     :param path: of the file, for the message
-    :raises ValueError: for keys and arguments that nobody takes, naming the nearest; if policy or n_timesteps is missing
+    :raises ValueError: for keys and arguments that nobody takes, naming the nearest; if policy or n_timesteps is missing; for
+        policies of other algorithms, and for values that our callback, buffer and presets refuse
     """
     where = f"{path}, {env_id}"
     algorithm = algorithms()[algo]
     arguments = set(inspect.signature(algorithm.__init__).parameters) - {"self", "env", "seed", "device"}
-    _check_names(hyperparameters, {*arguments, *ZOO_KEYS}, where)
+    check_names(where, hyperparameters, {*arguments, *ZOO_KEYS})
     missing = {"policy", "n_timesteps"} - set(hyperparameters)
     if missing:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
-        for name, kwargs in named_with_arguments(hyperparameters.get(key)):
-            _check_arguments(kwargs, _imported(name, f"{where}, {key}"), f"{where}, {key} {name}")
-    _check_arguments(
-        hyperparameters.get("replay_buffer_kwargs"), _buffer_class(hyperparameters), f"{where}, replay_buffer_kwargs"
-    )
-    policy = hyperparameters["policy"]
-    if isinstance(policy, str):
-        policy = _imported(policy, f"{where}, policy") if "." in policy else algorithm.policy_aliases.get(policy)
-    _check_arguments(hyperparameters.get("policy_kwargs"), policy, f"{where}, policy_kwargs")
-    if env_id.startswith(NAMESPACE):
-        _check_env_kwargs(hyperparameters.get("env_kwargs"), f"{where}, env_kwargs")
+        with told_where(f"{where}, {key}"):
+            named = named_with_arguments(hyperparameters.get(key))
+        for name, kwargs in named:
+            _check_made_of(_imported(name, f"{where}, {key}"), kwargs, f"{where}, {key} {name}")
+    _check_buffer(hyperparameters, algorithm, where)
+    policy_kwargs = _evaluated(hyperparameters.get("policy_kwargs"), f"{where}, policy_kwargs")
+    _check_policy_kwargs(policy_kwargs, _policy(hyperparameters["policy"], algo, where), f"{where}, policy_kwargs")
+    if issubclass(algorithm, DreamerAlgorithm):
+        _check_world_model({**hyperparameters, **(policy_kwargs or {})}, where)
+    _check_env_kwargs(hyperparameters.get("env_kwargs"), env_id, f"{where}, env_kwargs")
 
 
 def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
@@ -141,6 +159,7 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
     [('a.B', {}), ('c.D', {'e': 1})]
 
     :param named: a dotted path, ``{path: arguments}``, a list of these, or None
+    :raises ValueError: for arguments that are no mapping
     """
     items = named if isinstance(named, list) else [named]
     pairs: list[tuple[str, dict[str, Any]]] = []
@@ -148,45 +167,95 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
         if isinstance(item, str):
             pairs.append((item, {}))
         elif isinstance(item, Mapping):
-            pairs += [(str(path), dict(kwargs or {})) for path, kwargs in item.items()]
+            for path, kwargs in item.items():
+                if not isinstance(kwargs, Mapping):
+                    raise ValueError(f"the arguments of {path} must be a mapping, got {kwargs!r}: write {{}} for none.")
+                pairs.append((str(path), dict(kwargs)))
     return pairs
 
 
-def _check_names(given: Iterable[str], valid: Iterable[str], where: str) -> None:
-    for key in given:
-        if key not in valid:
-            raise ValueError(f"{where}: unknown key {key!r}.{nearest(str(key), valid)} Valid: {', '.join(sorted(valid))}.")
+def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
+    check_arguments(where, kwargs, taker)
+    if taker is ChallengerCallback:
+        with told_where(where):
+            ChallengerCallback(**kwargs)  # checks its arguments, and makes nothing before learn()
 
 
-def _check_arguments(given: Any, taker: Callable[..., Any] | None, where: str) -> None:
-    """Strings are Python that rl_zoo3 evaluates, and some take anything by name: both are left alone."""
-    if isinstance(given, Mapping) and taker is not None:
-        valid = _parameters(taker)
-        if valid is not None:
-            _check_names(given, valid, where)
+def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:
+    kind = _evaluated(hyperparameters.get("replay_buffer_class"), f"{where}, replay_buffer_class")
+    where = f"{where}, replay_buffer_kwargs"
+    kwargs = _evaluated(hyperparameters.get("replay_buffer_kwargs"), where) or {}
+    if kind is None:
+        kind = CPMBuffer if issubclass(algorithm, DreamerAlgorithm) else ReplayBuffer
+    check_arguments(where, kwargs, kind, excluded=SET_FOR_BUFFERS)
+    if isinstance(kind, type) and issubclass(kind, CPMBuffer):
+        arguments = {**_defaults(CPMBuffer), **kwargs}
+        with told_where(where):
+            for part in (check_values, ChallengeCurator):
+                part(**{name: arguments[name] for name in inspect.signature(part).parameters})
 
 
-def _parameters(taker: Callable[..., Any]) -> set[str] | None:
-    """:return: names of the arguments, of parents as far as they are passed on; None where there is no end of them"""
-    functions = (
-        [vars(kind)["__init__"] for kind in taker.__mro__ if "__init__" in vars(kind)] if isinstance(taker, type) else [taker]
-    )
-    names: set[str] = set()
-    for function in functions:
-        parameters = inspect.signature(function).parameters.values()
-        names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD} - {"self"}
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-            return names
-    return None
+def _policy(policy: Any, algo: str, where: str) -> Any:
+    """:return: the class"""
+    aliases = algorithms()[algo].policy_aliases
+    if isinstance(policy, str) and "." not in policy:
+        if policy not in aliases:
+            raise ValueError(
+                f"{where}: {algo} has no policy {policy!r}.{nearest(policy, aliases)} Valid: {', '.join(aliases)}, or a class "
+                "with its module, as sb3_cpm.PointNetPolicy."
+            )
+        return aliases[policy]
+    kind = _imported(policy, f"{where}, policy") if isinstance(policy, str) else policy
+    others = [other for other, one in algorithms().items() if _is_policy_of(one, kind)]
+    if others and algo not in others:
+        raise ValueError(
+            f"{where}: {policy} is a policy of {', '.join(others)}, not of {algo}, which has {', '.join(aliases)}. For point "
+            'clouds take policy: MultiInputPolicy and policy_kwargs: "dict(features_extractor_class=PointNetExtractor)".'
+        )
+    return kind
 
 
-def _check_env_kwargs(given: Any, where: str) -> None:
-    """Our tasks pass what they do not know on to ManiSkill, so only what looks like one of our arguments is refused."""
+def _is_policy_of(algorithm: type[BaseAlgorithm], policy: Any) -> bool:
+    return isinstance(policy, type) and issubclass(policy, tuple(algorithm.policy_aliases.values()))
+
+
+def _check_policy_kwargs(kwargs: Any, policy: Callable[..., Any], where: str) -> None:
+    check_arguments(where, kwargs, policy, excluded=SET_FOR_POLICIES)
+    kwargs, key = kwargs or {}, "features_extractor_class"
+    extractor = kwargs.get(key) or getattr(policy, "default_extractor", None) or _defaults(policy).get(key)
+    if isinstance(extractor, str):
+        raise ValueError(
+            f"{where}: features_extractor_class must be a class, got {extractor!r}. Write policy_kwargs as Python, in quotes: "
+            f'"dict(features_extractor_class={extractor.rpartition(".")[-1]})".'
+        )
+    if extractor is not None:
+        where = f"{where}, features_extractor_kwargs"
+        check_arguments(where, kwargs.get("features_extractor_kwargs"), extractor, excluded=("observation_space",))
+
+
+def _defaults(taker: Callable[..., Any]) -> dict[str, Any]:
+    return {name: parameter.default for name, parameter in inspect.signature(taker).parameters.items()}
+
+
+def _check_world_model(given: Mapping[str, Any], where: str) -> None:
+    with told_where(where):
+        preset = make_preset(given.get("preset") or "default")
+        # that of the one to start from is not known here
+        kind = given.get("uncertainty_class") or (None if given.get("start_from") else "plan2explore")
+        if kind is not None:
+            choose_uncertainty(kind, given.get("uncertainty_kwargs"), preset)
+
+
+def _check_env_kwargs(given: Any, env_id: str, where: str) -> None:
+    if given is None or not (env_id.startswith(NAMESPACE) or env_id == "CPMToy-v0"):
+        return
+    if env_id == "CPMToy-v0":
+        check_names(where, given, {*(argument_names(ToyEnv) or ()), "max_episode_steps", "disable_env_checker"})
+        return
     from sb3_cpm.envs import make_maniskill_env
 
+    # what our tasks do not know they pass on to ManiSkill, so only what looks like one of our arguments is refused
     known = [name for name in inspect.signature(make_maniskill_env).parameters if name != "task_kwargs"]
-    if not isinstance(given, Mapping):
-        return
     for key in given:
         guess = nearest(str(key), known, cutoff=0.75)
         if key not in known and guess:
@@ -195,17 +264,25 @@ def _check_env_kwargs(given: Any, where: str) -> None:
 
 def _imported(path: str, where: str) -> Callable[..., Any]:
     module_name, _, name = path.rpartition(".")
+    if not module_name:
+        raise ValueError(f"{where}: {path!r} must begin with its module, as sb3_cpm.ChallengerCallback does.")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ValueError(f"{where}: cannot import {path!r} ({error}).") from error
     if not hasattr(module, name):
-        raise ValueError(f"{where}: {module_name} has no {name!r}.{nearest(name, vars(module))}")
+        raise ValueError(f"{where}: {module_name} has no {name!r}.{nearest(name, dir(module))}")
     return getattr(module, name)
 
 
-def _buffer_class(hyperparameters: Mapping[str, Any]) -> Callable[..., Any] | None:
+def _evaluated(value: Any, where: str) -> Any:
+    """:return: what rl_zoo3 makes of a value in whose place it allows Python, in a string"""
+    if not isinstance(value, str):
+        return value
     from rl_zoo3 import exp_manager
 
-    name = hyperparameters.get("replay_buffer_class")
-    return vars(exp_manager).get(name) if isinstance(name, str) else name
+    try:
+        return eval(value, vars(exp_manager))
+    except Exception as error:  # it may be any Python
+        guess = nearest(error.name or "", vars(exp_manager)) if isinstance(error, NameError) else ""
+        raise ValueError(f"{where}: Python cannot evaluate {value!r} ({error}).{guess}") from error
