@@ -31,6 +31,7 @@ from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
+from sb3_cpm.world_model.observations import is_cloud, is_rangeless_image
 
 
 class ChallengerCallback(BaseCallback):
@@ -184,6 +185,7 @@ class ChallengerCallback(BaseCallback):
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
+            self._warn_of_unread_keys(buffer.player_keys)
         for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
             if d is not None:
                 d.env = env
@@ -212,6 +214,20 @@ class ChallengerCallback(BaseCallback):
         # what came before learning_starts, and what an earlier learn() left, is no backlog
         self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
         self._listen_for_ctrl_c()
+
+    def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
+        """Of a Dict that P and C share, each leaves out what the other may read; what neither does is lost."""
+        if player_keys is None or self.keys is not None:  # P reads everything, or the user has chosen
+            return
+        assert self.challenger is not None
+        for key, space in self.challenger.observation_space.items():
+            # point clouds are read on request only, and of images without bounds the challenger has told
+            if key not in (*player_keys, *self.challenger.keys) and not is_cloud(space) and not is_rangeless_image(space):
+                warnings.warn(
+                    f"Neither player nor challenger reads {key!r} ({space}). Let a wrapper make it a vector (a 1-D Box; "
+                    "one-hot for Discrete), or take MultiInputPolicy, which reads it.",
+                    stacklevel=2,
+                )
 
     def _on_rollout_start(self) -> None:
         self.stopwatch.stop("P trains")

@@ -256,9 +256,9 @@ def _kinds_of_keys(space: spaces.Space, keys: Sequence[str] | None) -> dict[str,
         chosen = {key: kind for key, kind in kinds.items() if kind in ("cloud", "vector")}
     if not chosen:
         raise ValueError(
-            f"PointNetExtractor found neither a point cloud (2-D float Box) nor a vector (1-D Box) in {kinds}. "
-            "Add one to the observation, or name the images to read: "
-            "policy_kwargs=dict(features_extractor_kwargs=dict(keys=[...]))."
+            f"PointNetExtractor found neither a point cloud (2-D float Box) nor a vector (1-D Box) in {kinds}. Add one to the "
+            "observation, name the images to read, policy_kwargs=dict(features_extractor_kwargs=dict(keys=[...])) (in a YAML "
+            "policy_kwargs: {features_extractor_kwargs: {keys: [...]}}), or take the policy MultiInputPolicy."
         )
     return chosen
 

@@ -598,6 +598,24 @@ def test_images_of_unequal_size():
         model.learn(10, callback=make_callback())
 
 
+def test_what_neither_player_nor_challenger_reads_is_told():
+    class WithDiscrete(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = spaces.Dict({**env.observation_space.spaces, "mode": spaces.Discrete(3)})
+
+        def observation(self, observation):
+            return {**observation, "mode": 1}
+
+    env = WithDiscrete(gym.make("CPMToy-v0"))
+    with pytest.warns(UserWarning, match="Neither player nor challenger reads 'mode'") as told:
+        make_model(env, policy=PointNetPolicy).learn(10, callback=make_callback())
+    assert len(told) == 1  # neither the camera, which C reads, nor the point cloud, which P reads
+    env = WithDiscrete(gym.make("CPMToy-v0", keys=("state",)))
+    make_model(env).learn(10, callback=make_callback())  # SB3's own policy reads everything
+    make_model(env, policy=PointNetPolicy).learn(10, callback=make_callback(keys=["state"]))
+
+
 def test_the_buffer_without_its_callback():
     with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
         make_model().learn(10)

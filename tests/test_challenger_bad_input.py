@@ -139,10 +139,14 @@ def test_images_neither_uint8_nor_in_a_declared_range(bounds: tuple[float, float
         assert ObservationSpec(space).keys == ("state",)
 
 
-@pytest.mark.parametrize("size", [84, 33, 50])
-def test_sizes_that_the_cnn_cannot_divide(size: int) -> None:
-    with pytest.raises(ValueError, match=rf"{size}x{size} pixels cannot be halved .* multiple of \d+ pixels"):
-        small(spaces.Dict({"camera": image(size)}))
+@pytest.mark.parametrize("size, layers", [(84, 2), (33, 0), (50, 1)])
+def test_sizes_that_the_cnn_cannot_divide(size: int, layers: int) -> None:
+    space = spaces.Dict({"camera": image(size)})
+    with pytest.raises(ValueError, match=rf"{size}x{size} pixels cannot be halved .* multiple of \d+ pixels") as told:
+        small(space)
+    assert (f"challenger_kwargs=dict(cnn_layers={layers})" in str(told.value)) == (layers > 0)
+    if layers:
+        small(space, cnn_layers=layers)
 
 
 # ---- numbers that are not finite ---------------------------------------------------------------------------------------

@@ -107,7 +107,11 @@ def test_float16_clouds_through_preprocessing() -> None:
     ("space", "kwargs", "message"),
     [
         (SPACE["state"], {}, "DictObservation"),
-        (spaces.Dict({"camera": SPACE["camera"]}), {}, "neither a point cloud"),
+        (
+            spaces.Dict({"camera": SPACE["camera"]}),
+            {},
+            "neither a point cloud.*in a YAML.*or take the policy MultiInputPolicy",
+        ),
         (SPACE, {"keys": ["lidar"]}, "lidar"),
         (SPACE, {"keys": []}, "neither a point cloud"),
         (spaces.Dict({"button": spaces.Discrete(3)}), {"keys": ["button"]}, "clouds, vectors and images"),

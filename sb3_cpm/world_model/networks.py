@@ -91,9 +91,14 @@ def cnn_layer_count(height: int, width: int, wanted: int) -> int:
         layers -= 1
     step = 2**layers
     if height % step or width % step:
+        possible = next((fewer for fewer in range(layers - 1, 0, -1) if not (height % 2**fewer or width % 2**fewer)), 0)
+        advice = (
+            f", or set the preset entry cnn_layers to {possible} (challenger_kwargs=dict(cnn_layers={possible}) of "
+            f"ChallengerCallback, preset=dict(cnn_layers={possible}) of Dreamer and Plan2Explore)"
+        )
         raise ValueError(
             f"Images of {height}x{width} pixels cannot be halved {layers} times. Render them at a multiple of {step} pixels "
-            f"per side (for example 32 or 64), or lower `cnn_layers`."
+            f"per side (for example 32 or 64){advice if possible else ''}."
         )
     return layers
 
