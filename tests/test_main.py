@@ -63,15 +63,15 @@ def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.Cap
     "options, told",
     [
         (["--seed", "-1"], "seed=-1: expected 0 or more"),
-        (["--model-kwargs", "learning_ratee=1"], "model_kwargs: unknown name 'learning_ratee'. Did you mean 'learning_rate'?"),
+        (["--model-kwargs", "learning_ratee=1"], "model_kwargs: unknown key 'learning_ratee'. Did you mean 'learning_rate'?"),
         (["--model-kwargs", "policy_kwargs={net_arc: [4]}"], "model_kwargs: unknown name 'net_arc'"),
         (
             ["--env-kwargs", "keyss=[state]"],
             "env_kwargs: CPMToy-v0 takes no 'keyss'. Did you mean 'keys'? Valid: keys, n_points",
         ),
-        (["--buffer-kwargs", "mixx=row"], "buffer_kwargs: unknown name 'mixx'. Did you mean 'mix'?"),
+        (["--buffer-kwargs", "mixx=row"], "buffer_kwargs: unknown key 'mixx'. Did you mean 'mix'?"),
         (["--buffer-kwargs", "filter_kwargs={widht: 1}"], "filter_kwargs: unknown key 'widht'"),
-        (["--callback-kwargs", "train_frek=1"], "callback_kwargs: unknown name 'train_frek'. Did you mean 'train_freq'?"),
+        (["--callback-kwargs", "train_frek=1"], "callback_kwargs: unknown key 'train_frek'. Did you mean 'train_freq'?"),
         (
             ["--callback-kwargs", "uncertainty_kwargs={metrik: log}"],
             "uncertainty_kwargs: unknown key 'metrik'. Did you mean 'metric'?",

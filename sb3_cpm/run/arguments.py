@@ -1,29 +1,9 @@
 """Misspelt names in settings that are handed on as arguments, told before anything is trained."""
 
 import contextlib
-import inspect
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
-
-from sb3_cpm.arguments import nearest
-
-
-def check_arguments(setting: str, given: Mapping[str, Any], taker: Callable[..., Any], excluded: Collection[str] = ()) -> None:
-    """
-    :param setting: where they come from, for the message
-    :param given: arguments by name
-    :param taker: what they are for
-    :param excluded: names of arguments that are not for this setting
-    :raises ValueError: for a name that is not among the arguments, with the nearest
-    """
-    parameters = inspect.signature(taker).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    valid = [parameter.name for parameter in parameters if parameter.name not in excluded]
-    for name in given:
-        if name not in valid:
-            raise ValueError(f"{setting}: unknown name {name!r}.{nearest(name, valid)} Valid: {', '.join(valid)}.")
 
 
 @contextlib.contextmanager

@@ -23,12 +23,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cpm.arguments import check_arguments
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
-from sb3_cpm.run.arguments import check_arguments, misspelt_names_told
+from sb3_cpm.run.arguments import misspelt_names_told
 from sb3_cpm.run.environment import make_env, make_vec_env
 from sb3_cpm.run.evaluation import FIRST_SEED, Evaluator, play_episode, success_rate
 from sb3_cpm.run.gallery import challenge_gallery
