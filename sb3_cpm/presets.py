@@ -165,7 +165,8 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     A complete preset.
 
     :param preset: name of a preset, or the entries that differ from "default"
-    :param overrides: further entries, they win
+    :param overrides: further entries, they win. Each replaces a whole entry, `uncertainty` too: give single arguments as
+        `uncertainty_kwargs`
     :return: plain Python numbers: NumPy's scalars would make a saved file unreadable
     :raises ValueError: for unknown names (with the nearest valid one), and values that cannot work, saying what they must be
     """
