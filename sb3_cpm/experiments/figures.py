@@ -254,7 +254,7 @@ def _draw_panels(panels: Sequence[Panel], experiment: Experiment, data: Data) ->
     tasks = sorted(set(table["env"]))
     if len(tasks) > 1:
         raise ValueError(f"Logged numbers are drawn of one task: choose task= one of {', '.join(map(repr, tasks))}.")
-    columns = min(3, len(panels))
+    columns = 2 if len(panels) == 4 else min(3, len(panels))
     figure, grid = _grid(-(-len(panels) // columns), columns)
     for axes, panel in zip(grid.flat, panels, strict=False):
         _draw_panel(axes, panel, experiment, table)
