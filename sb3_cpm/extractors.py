@@ -138,8 +138,9 @@ class PointNetExtractor(BaseFeaturesExtractor):
     :param sizes: layer sizes of the shared MLP of each PointNet
     :param input_transform: align each cloud by a predicted 3x3 matrix (T-Net); costs about half as much again
     :param state_arch: layer sizes of an MLP for the vectors, ``()`` to append them as they are
-    :param keys: the keys to read, by default all clouds and vectors; images are read only when named here
-    :param image_size: features per image, when images are named
+    :param keys: the keys to read, by default all clouds and vectors; images are read only when named here, or
+        where there is nothing else
+    :param image_size: features per image, when images are read
     :raises ValueError: for another space than Dict, a key that doesn't exist, a kind of key that cannot be read, or
         when nothing is left to read
     """
@@ -254,11 +255,11 @@ def _kinds_of_keys(space: spaces.Space, keys: Sequence[str] | None) -> dict[str,
             raise ValueError(f"PointNetExtractor reads clouds, vectors and images, not {unreadable}")
     else:
         chosen = {key: kind for key, kind in kinds.items() if kind in ("cloud", "vector")}
+        chosen = chosen or {key: kind for key, kind in kinds.items() if kind == "image"}
     if not chosen:
         raise ValueError(
-            f"PointNetExtractor found neither a point cloud (2-D float Box) nor a vector (1-D Box) in {kinds}. Add one to the "
-            "observation, name the images to read, policy_kwargs=dict(features_extractor_kwargs=dict(keys=[...])) (in a YAML "
-            "policy_kwargs: {features_extractor_kwargs: {keys: [...]}}), or take the policy MultiInputPolicy."
+            f"PointNetExtractor found neither a point cloud (2-D float Box) nor a vector (1-D Box) nor a uint8 image in "
+            f"{kinds}. Add one to the observation, or take the policy MultiInputPolicy."
         )
     return chosen
 

@@ -94,6 +94,14 @@ def test_every_parameter_gets_a_gradient() -> None:
         assert parameter.grad.abs().sum() > 0, name
 
 
+def test_images_are_read_where_there_is_nothing_else() -> None:
+    space = spaces.Dict({"camera": SPACE["camera"], "button": spaces.Discrete(3)})
+    extractor = PointNetExtractor(space)
+    assert extractor.player_keys == ("camera",)
+    camera = preprocess_obs({"camera": th.as_tensor(space["camera"].sample()[None])}, spaces.Dict({"camera": space["camera"]}))
+    assert extractor(camera).shape == (1, extractor.features_dim) == (1, 64)
+
+
 def test_float16_clouds_through_preprocessing() -> None:
     extractor = PointNetExtractor(SPACE)
     observations = batch()
@@ -108,9 +116,9 @@ def test_float16_clouds_through_preprocessing() -> None:
     [
         (SPACE["state"], {}, "DictObservation"),
         (
-            spaces.Dict({"camera": SPACE["camera"]}),
+            spaces.Dict({"button": spaces.Discrete(3)}),
             {},
-            "neither a point cloud.*in a YAML.*or take the policy MultiInputPolicy",
+            "neither a point cloud.*or take the policy MultiInputPolicy",
         ),
         (SPACE, {"keys": ["lidar"]}, "lidar"),
         (SPACE, {"keys": []}, "neither a point cloud"),
