@@ -427,7 +427,7 @@ def test_trials_merge_with_the_configuration(algo: str, tmp_path: Path) -> None:
     manager = manager_of(algo, tmp_path, 10)
     manager._hyperparams = {
         "policy_kwargs": {"share_features_extractor": False},
-        "replay_buffer_kwargs": {"filter_kwargs": {"w1": 3.0}},
+        "replay_buffer_kwargs": {"filter_kwargs": {"novelty_tolerance": 3.0}},
     }
     manager.specified_callbacks = [
         "rl_zoo3.callbacks.RawStatisticsCallback",
@@ -438,7 +438,7 @@ def test_trials_merge_with_the_configuration(algo: str, tmp_path: Path) -> None:
     with search.sampled(manager, trial) as changed:
         of_player = HYPERPARAMS_SAMPLER[algo](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
     buffer = changed._hyperparams["replay_buffer_kwargs"]
-    assert buffer == {"filter_kwargs": {"w1": 3.0}, "challenge_ratio": 0.05, "mix": "batch", "max_challenges": 5}
+    assert buffer == {"filter_kwargs": {"novelty_tolerance": 3.0}, "challenge_ratio": 0.05, "mix": "batch", "max_challenges": 5}
     (path, kwargs) = next(iter(changed.specified_callbacks[1].items()))
     assert path == "sb3_cpm.ChallengerCallback"
     assert kwargs["preset"] == "report" and kwargs["train_freq"] == 10 and kwargs["unit"] == "step"
@@ -493,7 +493,7 @@ CONFIGURED = {
     "policy": "MultiInputPolicy",
     "policy_kwargs": {"share_features_extractor": False},
     "replay_buffer_class": "CPMBuffer",
-    "replay_buffer_kwargs": {"filter_kwargs": {"w1": 3.0}},
+    "replay_buffer_kwargs": {"filter_kwargs": {"novelty_tolerance": 3.0}},
     "callback": {"sb3_cpm.ChallengerCallback": {"preset": "report"}},
 }
 
@@ -527,7 +527,7 @@ def test_a_trial_goes_into_any_configuration(
     config = "trial_of_sac" if kind == "module" else str(path)
     found, _ = manager_of("sac", tmp_path, 10, config=config, **study).read_hyperparameters()
     assert found["policy_kwargs"]["share_features_extractor"] is False and "net_arch" in found["policy_kwargs"]
-    assert found["replay_buffer_kwargs"] == {"filter_kwargs": {"w1": 3.0}, "challenge_ratio": 0.4, "mix": "row"}
+    assert found["replay_buffer_kwargs"] == {"filter_kwargs": {"novelty_tolerance": 3.0}, "challenge_ratio": 0.4, "mix": "row"}
     assert found["callback"] == [{"sb3_cpm.ChallengerCallback": {"preset": "report", "decay": "linear"}}]
     assert search.OURS not in found
 
