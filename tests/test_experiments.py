@@ -508,7 +508,10 @@ def test_crashed_runs_are_not_just_unfinished(tmp_path, tiny_experiment, monkeyp
     assert collect(tiny_experiment, tmp_path).notes == [
         "not finished yet, and drawn as far as they came: SAC/toy/seed2 (at step 60 of 120)"
     ]
-    (third.folder(tmp_path) / "crashed.txt").write_text("Traceback")
+    fourth = third.folder(tmp_path).with_name("seed3")
+    fourth.mkdir()
+    for folder in (third.folder(tmp_path), fourth):  # the last before it began: there is nothing to draw of it
+        (folder / "crashed.txt").write_text("Traceback")
     assert collect(tiny_experiment, tmp_path).notes == [
         "crashed, and drawn as far as they came: SAC/toy/seed2 (at step 60 of 120)"
     ]

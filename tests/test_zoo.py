@@ -438,7 +438,12 @@ def test_trials_merge_with_the_configuration(algo: str, tmp_path: Path) -> None:
     with search.sampled(manager, trial) as changed:
         of_player = HYPERPARAMS_SAMPLER[algo](trial, 2, 1, {"using_her_replay_buffer": False, "her_kwargs": {}})
     buffer = changed._hyperparams["replay_buffer_kwargs"]
-    assert buffer == {"filter_kwargs": {"novelty_tolerance": 3.0}, "challenge_ratio": 0.05, "mix": "batch", "max_challenges": 5}
+    assert buffer == {
+        "filter_kwargs": {"novelty_tolerance": 3.0},
+        "challenge_ratio": 0.05,
+        "mix": "batch",
+        "max_challenges": 5,
+    }
     (path, kwargs) = next(iter(changed.specified_callbacks[1].items()))
     assert path == "sb3_cpm.ChallengerCallback"
     assert kwargs["preset"] == "report" and kwargs["train_freq"] == 10 and kwargs["unit"] == "step"

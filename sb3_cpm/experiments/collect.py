@@ -78,10 +78,10 @@ def has_data(experiment: Experiment, results: str | Path, version: str, task: st
 
 
 def _folders(experiment: Experiment, results: str | Path, version: str, task: str | None) -> list[Path]:
-    """Those of the experiment's runs, of its own agents."""
+    """Those of the experiment's runs, of its own agents, but for runs that crashed before they began."""
     agents = [contender.name for contender in experiment.contenders]
     found = sorted((Path(results) / experiment.folder_name(version)).glob(f"*/{task or '*'}/seed*"))
-    return [path for path in found if path.parts[-3] in agents and any(path.glob("*.*"))]
+    return [path for path in found if path.parts[-3] in agents and any((*path.glob("*.csv"), *path.glob("*.yml")))]
 
 
 def _instead(experiment: Experiment, results: str | Path, version: str, task: str | None) -> str:
