@@ -31,7 +31,7 @@ from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
-from sb3_cpm.world_model.observations import is_cloud, is_rangeless_image
+from sb3_cpm.world_model.observations import unread
 
 
 class ChallengerCallback(BaseCallback):
@@ -220,14 +220,12 @@ class ChallengerCallback(BaseCallback):
         if player_keys is None or self.keys is not None:  # P reads everything, or the user has chosen
             return
         assert self.challenger is not None
-        for key, space in self.challenger.observation_space.items():
-            # point clouds are read on request only, and of images without bounds the challenger has told
-            if key not in (*player_keys, *self.challenger.keys) and not is_cloud(space) and not is_rangeless_image(space):
-                warnings.warn(
-                    f"Neither player nor challenger reads {key!r} ({space}). Let a wrapper make it a vector (a 1-D Box; "
-                    "one-hot for Discrete), or take MultiInputPolicy, which reads it.",
-                    stacklevel=2,
-                )
+        for key, space in unread(self.challenger.observation_space, (*player_keys, *self.challenger.keys)).items():
+            warnings.warn(
+                f"Neither player nor challenger reads {key!r} ({space}). Let a wrapper make it a vector (a 1-D Box; "
+                "one-hot for Discrete), or take MultiInputPolicy, which reads it.",
+                stacklevel=2,
+            )
 
     def _on_rollout_start(self) -> None:
         self.stopwatch.stop("P trains")

@@ -10,6 +10,9 @@ from gymnasium import spaces
 
 from sb3_cpm.arguments import SHARE, check, check_each, integer
 
+#: Arguments that SB3's algorithms give to their replay buffer themselves.
+SET_BY_ALGORITHMS = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
+
 
 def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_keys: Sequence[str] | None) -> None:
     """:raises ValueError: for observations that a buffer cannot hold, or that lack what its arguments ask for"""

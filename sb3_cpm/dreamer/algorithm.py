@@ -37,7 +37,7 @@ from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertai
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
-from sb3_cpm.world_model.observations import check_action_space, is_cloud, is_rangeless_image
+from sb3_cpm.world_model.observations import check_action_space, unread
 
 #: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
 _OF_CONSTRUCTOR = ("preset", "keys", "start_from", "uncertainty_class", "uncertainty_kwargs", "train_task_behavior")
@@ -147,14 +147,12 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
 
     def _warn_of_unread_keys(self) -> None:
         """Beside a player the challenger may leave things out; here nobody else reads them."""
-        for key, space in as_dict_space(self.observation_space).items():
-            # point clouds are read on request only, and of images without bounds the challenger has told
-            if key not in self.challenger.keys and not is_cloud(space) and not is_rangeless_image(space):
-                warnings.warn(
-                    f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
-                    "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
-                    stacklevel=4,
-                )
+        for key, space in unread(as_dict_space(self.observation_space), self.challenger.keys).items():
+            warnings.warn(
+                f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
+                "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
+                stacklevel=4,
+            )
 
     def _check_normalized_images(self) -> None:
         """

@@ -1,5 +1,6 @@
 """The CSV files of an experiment as tables, with everything odd about them said."""
 
+import contextlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,7 +75,11 @@ def collect(experiment: Experiment, results: str | Path, version: str = "full", 
 
 def has_data(experiment: Experiment, results: str | Path, version: str, task: str | None = None) -> bool:
     """:return: whether :func:`collect` finds anything"""
-    return not _join(_read(_folders(experiment, results, version, task), []), "evaluations").empty
+    for folder in _folders(experiment, results, version, task):
+        with contextlib.suppress(DamagedRunError):
+            if len(read_run(folder).tables["evaluations"]):
+                return True
+    return False
 
 
 def _folders(experiment: Experiment, results: str | Path, version: str, task: str | None) -> list[Path]:

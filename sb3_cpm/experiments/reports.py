@@ -52,14 +52,8 @@ def run_experiment(
         seeds or steps than one
     """
     experiment = find_experiment(name)
-    _check_seeds(seeds)
     specs = list(experiment.runs(version, seeds, steps, agents, tasks))
     return perform_all(specs, Path(results), jobs, tell, device)
-
-
-def _check_seeds(seeds: int | None) -> None:
-    if seeds is not None and seeds < 1:
-        raise ValueError(f"seeds={seeds}: expected 1 or more")
 
 
 def ensure_data(
@@ -204,8 +198,7 @@ def reproduce(
     version = experiment.trial(version, steps)
     if Path(results).exists() and not Path(results).is_dir():
         raise ValueError(f"--results {results} is no folder")
-    _check_seeds(seeds)
-    n_runs = len(list(experiment.runs(version, seeds, None, agents, tasks)))  # names that there are not are refused here
+    n_runs = len(list(experiment.runs(version, seeds, None, agents, tasks)))  # what there is not is refused here
     failed: list[RunResult] = []
     if not draw_only:
         plan = experiment.plan(version)

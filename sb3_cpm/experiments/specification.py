@@ -221,10 +221,13 @@ class Experiment:
         :param agents: names of contenders; None: all
         :param tasks: names of tasks; None: all
         :return: all runs, first seeds first
-        :raises ValueError: for a version that this experiment does not have, fewer steps than one, or a name, with the nearest
+        :raises ValueError: for a version that this experiment does not have, fewer seeds or steps than one, or a name, with
+            the nearest
         """
         from sb3_cpm.zoo.agents import algorithm_of
 
+        if seeds is not None and seeds < 1:
+            raise ValueError(f"seeds={seeds}: expected 1 or more")
         version = self.trial(version, steps)
         plan = self.plan(version)
         contenders = _chosen("agent", agents, self.contenders)

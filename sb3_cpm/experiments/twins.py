@@ -11,7 +11,7 @@ from typing import Any
 
 from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.specification import RunSpec
-from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
+from sb3_cpm.experiments.stored_run import read_run
 from sb3_cpm.experiments.tables import EVALUATIONS, Table
 
 
@@ -28,12 +28,13 @@ def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | No
         if folder == own or not run_folder.is_finished(folder):
             continue
         try:
-            theirs = read_run(folder).config
-        except DamagedRunError:  # told by whoever draws it
+            theirs = run_folder.read_yaml(path)
+            same = all(theirs.get(key) == config[key] for key in ("fingerprint", "sb3_cpm"))
+            if same and theirs.get("code", config["code"]) == config["code"]:
+                read_run(folder)
+                return folder
+        except (OSError, ValueError):  # damaged, which whoever draws it is told
             continue
-        same = all(theirs.get(key) == config[key] for key in ("fingerprint", "sb3_cpm"))
-        if same and theirs.get("code", config["code"]) == config["code"]:
-            return folder
     return None
 
 

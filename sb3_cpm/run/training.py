@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.arguments import check_arguments
 from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.run import folder as run_folder
@@ -42,8 +43,6 @@ from sb3_cpm.run.video import write_video
 N_SHOTS = 6
 #: What ``model_kwargs`` cannot change: the run's own.
 _OF_RUN = ("policy", "env", "replay_buffer_class", "replay_buffer_kwargs", "_init_setup_model")
-#: What ``buffer_kwargs`` cannot change: SB3 gives it.
-_OF_SB3 = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
 
 
 def train(settings: TrainSettings | None = None, callback: BaseCallback | None = None, **changes: Any) -> Summary:
@@ -272,7 +271,7 @@ def make_model(settings: TrainSettings, env: VecEnv) -> OffPolicyAlgorithm:
         kwargs["ent_coef"] = coefficient if coefficient.startswith("auto") else float(coefficient)
     algorithm = _algorithm(settings.algorithm)
     check_arguments("model_kwargs", settings.model_kwargs, algorithm, _OF_RUN)
-    check_arguments("buffer_kwargs", settings.buffer_kwargs, CPMBuffer, _OF_SB3)
+    check_arguments("buffer_kwargs", settings.buffer_kwargs, CPMBuffer, SET_BY_ALGORITHMS)
     kwargs.update(settings.model_kwargs)
     kwargs["replay_buffer_class"] = CPMBuffer
     kwargs["replay_buffer_kwargs"] = {"challenge_ratio": settings.challenge_ratio, **settings.buffer_kwargs}

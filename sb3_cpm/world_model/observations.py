@@ -5,7 +5,7 @@ Images are stacked on their channels and scaled to [-0.5, 0.5]; vectors are conc
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -261,6 +261,16 @@ def is_image(space: spaces.Space) -> bool:
 
 def is_3d(space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 3
+
+
+def unread(space: spaces.Dict, keys: Collection[str]) -> dict[str, spaces.Space]:
+    """
+    :param space: of the observations
+    :param keys: those that somebody reads
+    :return: the others that nobody could have known of: point clouds are read on request only, and of images without bounds
+        :class:`ObservationSpec` has told
+    """
+    return {key: sub for key, sub in space.items() if key not in keys and not is_cloud(sub) and not is_rangeless_image(sub)}
 
 
 def is_rangeless_image(space: spaces.Space) -> bool:

@@ -22,7 +22,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_cpm.arguments import argument_names, check_arguments, check_names, nearest, told_where
 from sb3_cpm.buffers import CPMBuffer
-from sb3_cpm.buffers.checks import check_values
+from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenger import choose_uncertainty
 from sb3_cpm.challenges import ChallengeCurator
@@ -46,8 +46,7 @@ ZOO_KEYS = (
     "noise_std",
 )
 
-#: Arguments that algorithms give to replay buffers and policies themselves.
-SET_FOR_BUFFERS = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
+#: Arguments that algorithms give to policies themselves.
 SET_FOR_POLICIES = ("observation_space", "action_space", "lr_schedule")
 
 
@@ -187,7 +186,7 @@ def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgori
     kwargs = _evaluated(hyperparameters.get("replay_buffer_kwargs"), where) or {}
     if kind is None:
         kind = CPMBuffer if issubclass(algorithm, DreamerAlgorithm) else ReplayBuffer
-    check_arguments(where, kwargs, kind, excluded=SET_FOR_BUFFERS)
+    check_arguments(where, kwargs, kind, excluded=SET_BY_ALGORITHMS)
     if isinstance(kind, type) and issubclass(kind, CPMBuffer):
         arguments = {**_defaults(CPMBuffer), **kwargs}
         with told_where(where):
