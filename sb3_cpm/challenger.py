@@ -17,7 +17,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
-from sb3_cpm.arguments import check_arguments, nearest
+from sb3_cpm.arguments import check_arguments, check_names, nearest
 from sb3_cpm.presets import make_preset, plain
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
@@ -602,15 +602,20 @@ def choose_uncertainty(
     :param kwargs: ``uncertainty_kwargs``
     :param preset: a complete one
     :return: its name in checkpoints, the class, and its arguments: the preset's with ``kwargs`` on top
-    :raises ValueError: for names that there are not, with the nearest
+    :raises ValueError: for names that there are not, with the nearest, also of arguments in the preset
     """
+    where = "Preset entry 'uncertainty'"
+    # a class of one's own has its module in its name, and may take its arguments in any way
+    known = {name: arguments for name, arguments in preset["uncertainty"].items() if "." not in name}
+    check_names(where, known, UNCERTAINTY_CLASSES)
+    for name, arguments in known.items():
+        check_arguments(f"{where}, {name}", arguments, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
     if isinstance(kind, str):
         if kind not in UNCERTAINTY_CLASSES:
             raise ValueError(
                 f"Unknown uncertainty class {kind!r}.{nearest(kind, UNCERTAINTY_CLASSES)} Valid: "
                 f"{sorted(UNCERTAINTY_CLASSES)} or a class."
             )
-        # a class of one's own may take its arguments in any way
         check_arguments("uncertainty_kwargs", kwargs, UNCERTAINTY_CLASSES[kind], excluded=("sizes",))
         return kind, UNCERTAINTY_CLASSES[kind], plain({**preset["uncertainty"].get(kind, {}), **(kwargs or {})})
     if not (isinstance(kind, type) and issubclass(kind, Uncertainty)):

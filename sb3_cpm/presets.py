@@ -14,18 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_cpm.arguments import (
-    AT_LEAST_0,
-    SHARE,
-    Rule,
-    check,
-    check_arguments,
-    check_names,
-    choice,
-    integer,
-    nearest,
-    number,
-)
+from sb3_cpm.arguments import AT_LEAST_0, SHARE, Rule, check, choice, integer, nearest, number
 
 REPORT: dict[str, Any] = {
     # what train() is fed with
@@ -184,19 +173,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
     result = plain({**result, **overrides})
     for key, rule in _RULES.items():
         check(f"Preset entry {key!r}", result[key], rule)
-    if "uncertainty" in overrides:
-        _check_uncertainty(result["uncertainty"])
     return result
-
-
-def _check_uncertainty(arguments: Mapping[str, Mapping[str, Any]]) -> None:
-    from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES  # torch, which plain data can do without
-
-    where = "Preset entry 'uncertainty'"
-    ours = {name: kwargs for name, kwargs in arguments.items() if "." not in name}  # others have their module in their name
-    check_names(where, ours, UNCERTAINTY_CLASSES)
-    for name, kwargs in ours.items():
-        check_arguments(f"{where}, {name}", kwargs, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
 
 
 def plain(value: Any) -> Any:

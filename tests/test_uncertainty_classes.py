@@ -9,6 +9,7 @@ import torch
 from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, small, vector, weights
 from gymnasium import spaces
 
+from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.presets import PRESETS
 from sb3_cpm.type_aliases import SequenceBatch
@@ -185,6 +186,21 @@ def test_presets_name_every_class() -> None:
 def test_wrong_arguments(name: str, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(name, kwargs)
+
+
+@pytest.mark.parametrize(
+    "entry, message",
+    [
+        ({"plan2explor": {}}, "'uncertainty': .*Did you mean 'plan2explore'"),
+        ({"rnd": {"unit": 3}}, "'uncertainty', rnd: unknown key 'unit'. Did you mean 'units'"),
+    ],
+)
+def test_wrong_arguments_in_a_preset(entry: dict[str, Any], message: str) -> None:
+    preset = {"uncertainty": entry}
+    with pytest.raises(ValueError, match=message):
+        Challenger(VECTOR, box(2), "cpu", preset)
+    with pytest.raises(ValueError, match=message):
+        ChallengerCallback(preset)  # and without an environment
 
 
 # ---- what tells them apart -------------------------------------------------------------------------------------------
