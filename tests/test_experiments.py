@@ -488,6 +488,14 @@ def test_a_diverged_run_is_told_and_no_earlier_step_passed_off(tmp_path, tiny_ex
     assert row["success_once"].startswith(f"{scores['success_once'].mean():.2f} [")
 
 
+def test_one_seed_has_no_interval(tmp_path, tiny_experiment, two_runs):
+    both = summary_table("tiny", tmp_path).iloc[0]
+    shutil.rmtree(two_runs[0].folder(tmp_path))
+    one = summary_table("tiny", tmp_path).iloc[0]
+    assert (both["seeds"], one["seeds"]) == (2, 1)
+    assert "[" in both["return"] and one["return"] == f"{float(one['return']):.2f}"
+
+
 def test_mixed_code_and_pytorch_are_noted(tmp_path, tiny_experiment, two_runs):
     config = two_runs[0].folder(tmp_path) / "config.yml"
     content = yaml.safe_load(config.read_text())

@@ -137,8 +137,8 @@ def summary_table(name: str, results: str | Path = RESULTS, version: str = "full
     :param results: folder of all results
     :param version: "full", "short" or "quick"
     :param task: only this one
-    :return: a row per task and agent: seeds, step, and per score the interquartile mean with its 95% interval as text;
-        ``to_markdown()`` makes text of it
+    :return: a row per task and agent: seeds, step, and per score the interquartile mean with its 95% interval as text,
+        which one seed does not have; ``to_markdown()`` makes text of it
     :raises ValueError: where there is no data, with the command that makes it
     """
     experiment = find_experiment(name)
@@ -160,7 +160,8 @@ def _last(part: pd.DataFrame) -> dict[str, object]:
         scores = per_seed(part[part["step"] == step], score)
         if len(scores):
             last = estimate(scores)
-            row[score] = f"{last.iqm[0]:.2f} [{last.low[0]:.2f}, {last.high[0]:.2f}]"
+            interval = f" [{last.low[0]:.2f}, {last.high[0]:.2f}]" if last.n_seeds > 1 else ""  # as the figures
+            row[score] = f"{last.iqm[0]:.2f}{interval}"
         else:
             row[score] = "-"
     return row
