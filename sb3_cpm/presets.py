@@ -1,10 +1,10 @@
 """
-Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; SPEC of the method in the documentation),
+Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; docs/method.md),
 and of what is made of its challenges (4.3 and B.6).
 
 ``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. ``"default"`` is
 small enough for two CPU cores: an update takes about 0.1 CPU seconds for vectors and 0.15 for two 32x32 cameras. ``"report"``
-takes 4 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
+takes 4 to 6 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
 ``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that
 differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
 """
