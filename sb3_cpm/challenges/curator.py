@@ -90,8 +90,7 @@ class ChallengeCurator:
         :param rewards: task rewards of a complete trajectory, shape ``(n_steps,)``
         :param evaluation: the challenger's evaluation of the same trajectory
         :return: the proposal, or None if the trajectory has no transition that counts (n_steps <= warmup_steps)
-        :raises ValueError: for shapes that don't belong together, values that are not finite, negative uncertainty;
-            nothing is changed then
+        :raises ValueError: for shapes that don't belong together and values that are not finite; nothing is changed then
         """
         rewards, disagreement, kl, embeddings = _checked(rewards, evaluation)
         first = self.warmup_steps
