@@ -253,6 +253,17 @@ _ALL = (
         "player",
     ),
     Experiment(
+        "report-configuration",
+        "",
+        "PickCube-v1 with all constants of the report, beside the small challenger and SAC",
+        "not in the report, whose own two CPM agents are handicapped: its world model, and its few updates of the player",
+        (REPORT, SIMPLE, SAC_CLOUD),
+        "curves",
+        replace(_FULL, cost="7 to 10 CPU hours per run, less with a GPU"),
+        Plan((TOY,), 750, 250, 5, 1, {"sac": {"learning_starts": 200, "batch_size": 64}}, cost="5 minutes on 2 cores"),
+        short=replace(_SHORT, cost="10 to 70 CPU minutes per run, by agent and processor"),
+    ),
+    Experiment(
         "controllers",
         "B.3",
         "The robot's controllers, PickCube-v1 from state vectors",
