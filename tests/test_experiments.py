@@ -23,7 +23,7 @@ from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
 from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.evaluation import evaluate
-from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES
+from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES, write_title
 from sb3_cpm.experiments.grid import attempt, perform_all
 from sb3_cpm.experiments.player_losses import player_losses
 from sb3_cpm.experiments.run_folder import LockedError, description, locked
@@ -786,6 +786,17 @@ def test_every_agent_has_a_colour_of_its_own(name):
     assert len(set(COLOURS)) == len(COLOURS) >= len(EXPERIMENTS[name].contenders)
     lines = draw_lines(EXPERIMENTS[name])
     assert len(set(lines)) == len(EXPERIMENTS[name].contenders)
+
+
+@pytest.mark.parametrize("width", [5, 10, 15])
+def test_titles_fit_into_their_figures(width):
+    """matplotlib cuts off what is too long, on both sides."""
+    for experiment in EXPERIMENTS.values():
+        figure = plt.figure(figsize=(width, 4), layout="constrained")
+        write_title(figure, f"Figure 9: {experiment.title}\nruns of five-agents, short version, on PickCube-v1")
+        extent = figure._suptitle.get_window_extent()
+        assert extent.x0 >= 0 and extent.x1 <= figure.bbox.width
+        plt.close(figure)
 
 
 def test_the_legend_has_every_agent_once():

@@ -5,6 +5,7 @@ Lines are interquartile means over seeds, bands 95% stratified bootstrap interva
 """
 
 import re
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -129,8 +130,20 @@ def draw_experiment(
     tasks = ", ".join(dict.fromkeys(data.tables["evaluations"]["env"]))
     with plt.rc_context(STYLE):
         figure = DRAWINGS[experiment.drawing](drawn, data)
-        figure.suptitle(_title(experiment, version, source, tasks), fontweight="bold")
+        write_title(figure, _title(experiment, version, source, tasks))
     return figure, data.notes
+
+
+def write_title(figure: Figure, text: str) -> None:
+    """
+    :param figure: gets the title, in as many lines as its width asks for
+    :param text: of the title; its lines stay lines
+    """
+    title = figure.suptitle(text, fontweight="bold")
+    share = 0.95 * figure.bbox.width / title.get_window_extent().width
+    if share < 1.0:
+        columns = int(share * max(len(line) for line in text.splitlines()))
+        title.set_text("\n".join(textwrap.fill(line, columns) for line in text.splitlines()))
 
 
 def _title(experiment: Experiment, version: str, source: Experiment | None, tasks: str) -> str:
