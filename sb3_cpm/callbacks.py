@@ -8,7 +8,8 @@ environment, through which ``learn()`` takes its steps.
 import signal
 import threading
 import warnings
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -363,25 +364,41 @@ class ChallengerCallback(BaseCallback):
         if threading.current_thread() is not threading.main_thread():
             return
         previous = signal.getsignal(signal.SIGINT)
-        if not callable(previous):
-            return
-
-        def handler(signum: int, frame: FrameType | None) -> None:
-            try:
-                previous(signum, frame)
-            except BaseException:
-                self._detach()
-                raise
-            # one that returns, a flag set, lets the run go on, and C with it
-
-        signal.signal(signal.SIGINT, handler)
-        self._previous_sigint = previous
+        while isinstance(previous, _CtrlC) and previous.callback() in (None, self):  # left behind by a learn() that failed
+            previous = previous.previous
+        if callable(previous):
+            signal.signal(signal.SIGINT, _CtrlC(self, previous))
+            self._previous_sigint = previous
 
     def __getstate__(self) -> dict[str, Any]:
         """A callback is not part of a saved model, but checkpointing tools may pickle what refers to it."""
         state = self.__dict__.copy()
         state.update(_env=None, _previous_sigint=None)
         return state
+
+
+class _CtrlC:
+    """
+    Takes the wrapper off where Ctrl-C ends a run. An exception that reaches no hook of ours leaves it behind, so it does not
+    keep the callback alive, nor by that the model and its replay buffer.
+
+    :param callback: to detach
+    :param previous: the handler that was there before
+    """
+
+    def __init__(self, callback: ChallengerCallback, previous: Callable[[int, FrameType | None], Any]):
+        self.callback = weakref.ref(callback)
+        self.previous = previous
+
+    def __call__(self, signum: int, frame: FrameType | None) -> None:
+        try:
+            self.previous(signum, frame)
+        except BaseException:
+            callback = self.callback()
+            if callback is not None:
+                callback._detach()
+            raise
+        # one that returns, a flag set, lets the run go on, and C with it
 
 
 def _check_challenger_kwargs(given: Any) -> None:

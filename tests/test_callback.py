@@ -1,8 +1,10 @@
 """The whole method through stock SB3: two lines of user code, save and load, seeds, several environments, bad input."""
 
+import gc
 import os
 import pickle
 import signal
+import weakref
 
 import gymnasium as gym
 import numpy as np
@@ -348,6 +350,21 @@ def test_an_exception_of_another_callback_leaves_nothing_behind():
     assert callback._env.n_explored == explored and model.replay_buffer.size() == size
     model.learn(100, callback=callback, reset_num_timesteps=False)
     assert callback.explored_share == 1.0 and model.env is env
+
+
+def test_an_exception_keeps_no_model_alive():
+    """SB3 tells no callback of it, so the handler of Ctrl-C stays: of that there may be many in a notebook."""
+    before, buffers = signal.getsignal(signal.SIGINT), []
+    for _ in range(3):
+        model = make_model()
+        buffers.append(weakref.ref(model.replay_buffer))
+        with pytest.raises(ZeroDivisionError):
+            model.learn(200, callback=[make_callback(), RaisesAt(130, lambda: 1 / 0)])
+        del model
+    gc.collect()
+    assert [buffer() for buffer in buffers] == [None] * 3
+    make_model().learn(10, callback=make_callback())
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_an_exception_while_p_trains_leaves_nothing_that_acts():
