@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 
 from sb3_cpm.buffers import CPMBuffer, Demonstration
 from sb3_cpm.type_aliases import Evaluation
@@ -184,6 +185,45 @@ def test_otherwise_the_actions_are_replayed(tmp_path, caplog):
     assert "1 of 3 episodes did not succeed" in caplog.text
     _, third = buffer.demonstrations.episodes
     np.testing.assert_array_equal(buffer.demonstrations.episode_observations(third)["state"], [[12, i] for i in range(4)])
+
+
+class PhotographedEnv(CounterEnv):
+    """As cameras give images: the channels last."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Dict({**SPACE.spaces, "camera": spaces.Box(0, 255, (36, 48, 3), np.uint8)})
+
+    def photographed(self, observation):
+        picture = np.arange(36 * 48 * 3, dtype=np.int64).reshape(36, 48, 3) + int(self.state[1])
+        return {**observation, "camera": (picture % 256).astype(np.uint8)}
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return self.photographed(observation), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return self.photographed(observation), *rest
+
+
+@pytest.mark.parametrize("where", ["replayed", "in the file"])
+def test_images_as_environments_give_them(where, tmp_path):
+    """SB3 puts the channels first around the training environment: neither files nor the single environment know of it."""
+    env = PhotographedEnv()
+    arguments = dict(replay_buffer_class=CPMBuffer, replay_buffer_kwargs=dict(challenge_ratio=0), buffer_size=100)
+    buffer = SAC("MultiInputPolicy", env, policy_kwargs=dict(net_arch=[8]), device="cpu", **arguments).replay_buffer
+    assert buffer.observation_space["camera"].shape == (3, 36, 48)
+    path = write(tmp_path, [4], "dict", rewards=True)
+    pictures = np.stack([env.reset(seed=10)[0]["camera"], *(env.step([1.0])[0]["camera"] for _ in range(4))])
+    if where == "in the file":
+        with h5py.File(path, "a") as file:
+            file["traj_0/obs"].create_dataset("camera", data=pictures)
+        env = None
+    assert buffer.add_demonstrations(path, env=env) == 1
+    stored = buffer.demonstrations.episode_observations(buffer.demonstrations.episodes[0])["camera"]
+    np.testing.assert_array_equal(stored, pictures.transpose(0, 3, 1, 2))
+    buffer.sample(4)
 
 
 @pytest.mark.parametrize("broken", ["no json", "json", "truncated", "no file", "actions", "other json", "start"])

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +26,8 @@ class Demonstration:
     """
     A recorded episode of T transitions.
 
-    :param observations: one array per key of the observation space, each of shape ``(T + 1, *observation_shape)``
+    :param observations: one array per key of the observation space, each of shape ``(T + 1, *observation_shape)``; images may
+        have their channels last, as environments give them, where the space has them first, as SB3 puts them
     :param actions: in the environment's units, shape ``(T, *action_shape)``
     :param rewards: shape ``(T,)``
     :param terminated: the environment ended the episode itself; if not, it was cut off and the critic bootstraps
@@ -133,9 +135,14 @@ def _recorded_observations(recorded: Any, space: spaces.Dict) -> dict[str, np.nd
     if not set(space.spaces) <= set(obs.keys()):
         return None
     found = {key: obs[key] for key in space.spaces}
-    if any(not hasattr(array, "shape") or array.shape[1:] != space.spaces[key].shape for key, array in found.items()):
+    if any(not hasattr(array, "shape") or not _fits(array.shape[1:], space.spaces[key]) for key, array in found.items()):
         return None
     return {key: np.asarray(array[:], dtype=space.spaces[key].dtype) for key, array in found.items()}
+
+
+def _fits(shape: tuple[int, ...], space: spaces.Space) -> bool:
+    """Whether observations of this shape are those of the space, images also before SB3 has put their channels first."""
+    return shape == space.shape or (is_image_space(space) and (*shape[-1:], *shape[:-1]) == space.shape)
 
 
 def _needs_env(path: Path, index: dict[str, Any], recorded: Any, observations_fit: bool) -> str:
@@ -204,13 +211,17 @@ def as_transitions(
     missing = set(observation_space.spaces) - set(episode.observations)
     if missing:
         raise ValueError(f"A demonstration lacks the observations {sorted(missing)}")
+    observations = {}
     for key, space in observation_space.spaces.items():
         wanted = (n_steps + 1, *(space.shape or ()))
-        if np.shape(episode.observations[key]) != wanted:
+        array = np.asarray(episode.observations[key])
+        if array.shape != wanted and _fits(array.shape[1:], space):
+            array = np.moveaxis(array, -1, 1)  # as SB3's VecTransposeImage does around the training environment
+        if array.shape != wanted:
             raise ValueError(
-                f"A demonstration of {n_steps} steps has observations {key!r} of shape "
-                f"{np.shape(episode.observations[key])}, expected {wanted}"
+                f"A demonstration of {n_steps} steps has observations {key!r} of shape {array.shape}, expected {wanted}"
             )
+        observations[key] = array
     actions = np.asarray(episode.actions)
     if actions.shape != (n_steps, *(action_space.shape or ())):
         raise ValueError(
@@ -220,8 +231,8 @@ def as_transitions(
     for step in range(n_steps):
         last = step == n_steps - 1
         yield (
-            {key: np.asarray(episode.observations[key][step])[None] for key in observation_space.spaces},
-            {key: np.asarray(episode.observations[key][step + 1])[None] for key in observation_space.spaces},
+            {key: array[step][None] for key, array in observations.items()},
+            {key: array[step + 1][None] for key, array in observations.items()},
             actions[step][None],
             np.asarray([episode.rewards[step]], dtype=np.float32),
             np.array([last]),
