@@ -221,6 +221,9 @@ class Challenger:
 
         :param observations: of the states 0..T, the true last one included, per key of shape ``(T + 1, *observation_shape)``
         :param actions: action ``t`` was taken in state ``t``, shape ``(T, action_dim)``, within [-1, 1]
+        :raises ValueError: for another number of observations, and where the uncertainty gives a novelty below zero that is
+            said to be ``nonnegative``, or of another shape than one number per transition
+        :raises RuntimeError: if KL or novelty are not finite
         """
         taken = self._tensor(actions).view(-1, self.action_dim)
         length = len(taken) + 1
@@ -233,10 +236,14 @@ class Challenger:
             raise ValueError(f"An episode of {len(taken)} actions has {length} observations, got {len(embed)}.")
         posterior = self.world_model.rssm.observe(embed.unsqueeze(1), rows, first, deterministic=True)
         kl = self.world_model.kl(posterior)[1:, 0]
-        novelty = self.uncertainty.novelty(self._transitions(posterior, rows, embed.unsqueeze(1)))[:, 0]
+        novelty = self._novelty(self._transitions(posterior, rows, embed.unsqueeze(1)))[:, 0]
         if not (torch.isfinite(kl).all() and torch.isfinite(novelty).all()):
             raise RuntimeError("KL or disagreement of an episode is not finite: are its observations and actions?")
-        assert not self.uncertainty.nonnegative or bool((novelty >= 0.0).all()), "disagreement below zero"
+        if self.uncertainty.nonnegative and bool((novelty < 0.0).any()):
+            raise ValueError(
+                f"The uncertainty {self.uncertainty_name} gave a novelty of {novelty.min():.4g}, below zero, which S, F and R "
+                "do not expect. Let it return magnitudes, or set `nonnegative = False` in the class."
+            )
         return Evaluation(novelty.float().cpu().numpy(), kl.clamp(min=0.0).cpu().numpy(), embed.cpu().numpy())
 
     def open_loop(self, observations: Mapping[str, Array], actions: Array, context: int) -> OpenLoop:
@@ -376,9 +383,17 @@ class Challenger:
         return start.select(place % n), (place < n) * (len(place) / n)
 
     def _imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
-        return self.uncertainty.novelty(
-            Transitions(imagined.feats, imagined.actions, imagined.next_stochs, imagined.next_deters)
-        )
+        return self._novelty(Transitions(imagined.feats, imagined.actions, imagined.next_stochs, imagined.next_deters))
+
+    def _novelty(self, transitions: Transitions) -> torch.Tensor:
+        """:raises ValueError: unless the uncertainty gives a number per transition: others might be broadcast unnoticed"""
+        novelty, expected = self.uncertainty.novelty(transitions), transitions.feat.shape[:-1]
+        if novelty.shape != expected:
+            raise ValueError(
+                f"The uncertainty {self.uncertainty_name} gave a novelty of shape {tuple(novelty.shape)} for transitions of "
+                f"shape {tuple(expected)}: it must be one number for each."
+            )
+        return novelty
 
     def _imagined_reward(self, imagined: Imagination) -> torch.Tensor:
         return self.world_model.reward(imagined.next_feats)

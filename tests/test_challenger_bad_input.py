@@ -10,6 +10,8 @@ from challenger_helpers import BOTH, SMALL, VECTOR, box, image, random_batch, sm
 from gymnasium import spaces
 
 from sb3_cpm.challenger import Challenger, choose_device
+from sb3_cpm.uncertainty import Transitions
+from sb3_cpm.uncertainty.base import LatentSizes, Uncertainty
 from sb3_cpm.world_model.observations import ObservationSpec
 
 CPU = torch.device("cpu")
@@ -180,6 +182,36 @@ def test_novelty_that_is_not_finite_is_named() -> None:
         challenger.uncertainty.ensemble.weights[0][1, 0, 0] = torch.nan
     with pytest.raises(RuntimeError, match="The uncertainty loss became nan"):
         challenger.train(random_batch(VECTOR, 2))
+
+
+class Signed(Uncertainty):
+    """A measure of one's own that is below zero at times, or has a dimension too many."""
+
+    def __init__(self, sizes: LatentSizes, keepdim: bool = False) -> None:
+        super().__init__(sizes)
+        self.net, self.keepdim = torch.nn.Linear(sizes.feat, sizes.stoch), keepdim
+
+    def novelty(self, transitions: Transitions) -> torch.Tensor:
+        return -(self.net(transitions.feat) - transitions.next_stoch).abs().mean(-1, keepdim=self.keepdim)
+
+    def loss(self, transitions: Transitions) -> torch.Tensor:
+        return -self.novelty(transitions).mean()
+
+
+def test_what_an_uncertainty_of_ones_own_gives_is_checked() -> None:
+    rng = np.random.default_rng(0)
+    episode = {"state": rng.normal(size=(6, 3)).astype(np.float32)}, rng.uniform(-1, 1, (5, 2)).astype(np.float32)
+    signed = small(uncertainty_class=Signed)
+    signed.train(random_batch(VECTOR, 2))
+    with pytest.raises(ValueError, match=r"Signed gave a novelty of -.*, below zero.*set `nonnegative = False`"):
+        signed.evaluate(*episode)
+    signed.uncertainty.nonnegative = False
+    assert (signed.evaluate(*episode).disagreement < 0.0).all()
+    wide = small(uncertainty_class=Signed, uncertainty_kwargs={"keepdim": True})
+    with pytest.raises(ValueError, match=r"Signed gave a novelty of shape \(.*, 1\) for transitions .* one number for each"):
+        wide.train(random_batch(VECTOR, 2))
+    with pytest.raises(ValueError, match=r"novelty of shape \(5, 1, 1\) for transitions of shape \(5, 1\)"):
+        wide.evaluate(*episode)
 
 
 def test_a_broken_challenger_does_not_replace_a_good_checkpoint(tmp_path: pathlib.Path) -> None:
