@@ -655,6 +655,13 @@ def test_a_loaded_model_keeps_its_networks(tmp_path, kind, given, message):
         kind.load(tmp_path / "model", device="cpu", **given)
 
 
+@pytest.mark.parametrize("saved, loaded", [(Plan2Explore, Dreamer), (Dreamer, Plan2Explore)])
+def test_a_model_of_the_other_algorithm_is_not_loaded(tmp_path, saved, loaded):
+    make(kind=saved).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=rf"no model of {loaded.__name__}: .*{loaded.__name__}\(\.\.\., start_from="):
+        loaded.load(tmp_path / "model", device="cpu")
+
+
 def test_what_a_loaded_model_began_with_is_past(tmp_path):
     model = make(start_from=make(kind=Plan2Explore), pretrain_steps=3).learn(80)
     model.save(tmp_path / "model")

@@ -385,7 +385,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         :param force_reset: reset ``env`` before training
         :param kwargs: arguments of the constructor to change; ``preset`` is a name, or the entries that differ from the saved
             ones. ``start_from`` and ``pretrain_steps`` mean nothing to a model that has learnt, and are told with a warning
-        :raises ValueError: for arguments that ask for other networks than the saved ones
+        :raises ValueError: for arguments that ask for other networks than the saved ones, and for a model of the other
+            algorithm, which would go on acting as that one does
         """
         given = {name: kwargs.pop(name) for name in _OF_CONSTRUCTOR if kwargs.get(name) is not None}
         if given.pop("start_from", None) is not None:
@@ -412,6 +413,11 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
                 f"{path} cannot be loaded with {changes}; a saved model keeps its networks, rates and constants may change: "
                 f"{reason}"
             ) from error
+        if model.policy.behavior != cls.behavior:
+            raise ValueError(
+                f"{path} is no model of {cls.__name__}: the behaviour that acts is {model.policy.behavior!r}, not "
+                f"{cls.behavior!r}. {cls.__name__}(..., start_from={str(path)!r}) starts from what it has learnt."
+            )
         if "adam_eps" in changes:  # the optimizers' saved states have the saved one
             for optimizer in model.challenger.optimizers.values():
                 for group in optimizer.adam.param_groups:
