@@ -498,12 +498,12 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
 
 def max_episode_steps(env: VecEnv) -> int | None:
     """:return: the time limit of the environments, None where there is none or none can be known"""
-    if isinstance(env.unwrapped, SubprocVecEnv):
-        # Not every spec can be pickled, and a worker that cannot send what it was asked for dies: ask for TimeLimit's number
-        limits = env.get_attr("_max_episode_steps") if env.has_attr("_max_episode_steps") else []
-    else:
+    limits: list[int | None] = []
+    if not isinstance(env.unwrapped, SubprocVecEnv):  # not every spec can be pickled, and a worker that cannot send one dies
         try:
             limits = [spec.max_episode_steps for spec in env.get_attr("spec") if spec is not None]
         except AttributeError:  # VecEnvs that are not made of gymnasium environments
             return None
+    if not limits and env.has_attr("_max_episode_steps"):  # TimeLimit's, also around environments that are not registered
+        limits = env.get_attr("_max_episode_steps")
     return max((limit for limit in limits if limit is not None), default=None)

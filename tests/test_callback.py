@@ -19,10 +19,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
-import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetPolicy
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.callbacks import without_exploration
+from sb3_cpm.envs.toy import ToyEnv
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.exploration import ExplorationVecEnv
 
@@ -584,6 +584,16 @@ def test_a_spec_that_no_process_can_send():
         make_model(env, learning_starts=99).learn(10, callback=make_callback())
     make_model(env).learn(110, callback=make_callback())
     env.close()
+
+
+def test_a_time_limit_around_an_environment_that_is_not_registered():
+    """It has no spec, so gymnasium's wrapper has none either, but it knows when it ends an episode."""
+    env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(ToyEnv(keys=("state",)), 30)] * 2)
+    with pytest.raises(ValueError, match="up to 30 steps in each of 2 environments.*learning_starts=60 or more"):
+        make_model(env, learning_starts=59).learn(10, callback=make_callback())
+    with pytest.raises(ValueError, match="buffer_size=120 or more"):
+        make_model(env, buffer_size=119).learn(10, callback=make_callback())
+    make_model(env, learning_starts=60).learn(70, callback=make_callback())
 
 
 def test_processes_without_a_time_limit():
