@@ -387,6 +387,7 @@ def test_observations_take_half_of_the_memory():
         (dict(coefficient_kwargs=dict(foo=1)), "coefficient_kwargs: unknown key 'foo'"),
         (dict(storage_dtypes=["state"]), r"storage_dtypes must say how .* got \['state'\]"),
         (dict(n_sampled_goal=4), "achieved_goal"),
+        (dict(n_sampled_goal=-4), "n_sampled_goal must be a finite number of at least 0, got -4"),
         (dict(player_keys=["stat"]), "stat"),
         (dict(observation_space=spaces.Box(-1, 1, (3,))), "sb3_cpm.envs.DictObservation"),
         (dict(action_space=spaces.Discrete(3)), "continuous actions"),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_cpm.arguments import SHARE, check, check_each, integer
+from sb3_cpm.arguments import AT_LEAST_0, SHARE, check, check_each, integer
 
 #: Arguments that SB3's algorithms give to their replay buffer themselves.
 SET_BY_ALGORITHMS = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
@@ -21,6 +21,7 @@ def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_ke
             f"CPMBuffer needs a Dict observation space, got {observation_space}. Wrap the environment in "
             'sb3_cpm.envs.DictObservation(env) and use "MultiInputPolicy" (SAC, TD3, DDPG and TQC have one, CrossQ has none).'
         )
+    check("n_sampled_goal", n_sampled_goal, AT_LEAST_0)
     missing = {"achieved_goal", "desired_goal"} - set(observation_space.spaces)
     if n_sampled_goal > 0 and missing:
         raise ValueError(
