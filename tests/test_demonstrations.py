@@ -12,8 +12,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cpm.buffers import CPMBuffer, Demonstration
+from sb3_cpm.dreamer import Dreamer
 from sb3_cpm.type_aliases import Evaluation
 
 h5py = pytest.importorskip("h5py", reason="h5py comes with mani_skill")
@@ -224,6 +226,34 @@ def test_images_as_environments_give_them(where, tmp_path):
     stored = buffer.demonstrations.episode_observations(buffer.demonstrations.episodes[0])["camera"]
     np.testing.assert_array_equal(stored, pictures.transpose(0, 3, 1, 2))
     buffer.sample(4)
+
+
+class FlatEnv(CounterEnv):
+    """With a Box observation, as Dreamer takes it."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = SPACE["state"]
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return observation["state"], info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return observation["state"], *rest
+
+
+def test_replayed_where_observations_are_no_dict(tmp_path):
+    buffer = Dreamer("MlpPolicy", FlatEnv(), buffer_size=100, device="cpu").replay_buffer
+    assert buffer.add_demonstrations(write(tmp_path, [4]), env=FlatEnv()) == 1
+    stored = buffer.demonstrations.episode_observations(buffer.demonstrations.episodes[0])["state"]
+    np.testing.assert_array_equal(stored, [[10, i] for i in range(5)])
+
+
+def test_a_vec_env_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="replayed in a single environment"):
+        make().add_demonstrations(write(tmp_path, [4]), env=DummyVecEnv([CounterEnv]))
 
 
 @pytest.mark.parametrize("broken", ["no json", "json", "truncated", "no file", "actions", "other json", "start"])

@@ -9,7 +9,7 @@ one, and the recorded actions are replayed in it, from the recorded seeds.
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,8 @@ def read_demonstrations(
     """
     path = Path(path)
     h5py = _h5py()
+    if isinstance(env, VecEnv):
+        raise ValueError("Actions are replayed in a single environment, as gymnasium.make() gives it: `env` is a VecEnv")
     index = _read_index(path.with_suffix(".json"))
     if not path.is_file():
         raise ValueError(f"There is no file {path}")
@@ -77,7 +80,7 @@ def read_demonstrations(
                 continue
             if env is None:
                 raise ValueError(_needs_env(path, index, recorded, observations is not None))
-            episode, succeeded = _replay(env, record, recorded)
+            episode, succeeded = _replay(env, record, recorded, observation_space)
             if record.get("success", succeeded) and not succeeded:
                 failed += 1
             else:
@@ -155,11 +158,12 @@ def _needs_env(path: Path, index: dict[str, Any], recorded: Any, observations_fi
     )
 
 
-def _replay(env: Any, record: dict[str, Any], recorded: Any) -> tuple[Demonstration, bool]:
+def _replay(env: Any, record: dict[str, Any], recorded: Any, space: spaces.Dict) -> tuple[Demonstration, bool]:
     """
     :param env: gymnasium environment
     :param record: the episode's entry in the .json
     :param recorded: its group in the .h5
+    :param space: what the observations must be
     :return: what the recorded actions do there, and whether that succeeded
     """
     seed = record.get("episode_seed", record.get("reset_kwargs", {}).get("seed"))
@@ -177,6 +181,8 @@ def _replay(env: Any, record: dict[str, Any], recorded: Any) -> tuple[Demonstrat
         rewards.append(float(reward))
         if terminated or truncated:
             break
+    if not isinstance(obs, Mapping) and len(space.spaces) == 1:  # Dreamer's buffer has a Box observation under one key
+        observations = [dict.fromkeys(space.spaces, one) for one in observations]
     stacked = {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
     succeeded = bool(info.get("is_success", info.get("success", True)))
     return Demonstration(stacked, actions[: len(rewards)], np.array(rewards), bool(terminated)), succeeded
