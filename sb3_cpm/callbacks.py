@@ -20,6 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
@@ -63,7 +64,7 @@ class ChallengerCallback(BaseCallback):
     :param gradient_steps: number of its updates then
     :param load_path: a challenger saved by :meth:`save` to start from
     :param device: PyTorch device of the challenger; "auto": the model's
-    :param verbose: 1 for messages
+    :param verbose: as SB3's callbacks have it; this one says nothing of its own
     :raises ValueError: for arguments that cannot work, naming the nearest where one is misspelt; in ``learn()``, before any
         training, for models that this cannot work with
     """
@@ -99,6 +100,8 @@ class ChallengerCallback(BaseCallback):
         self.uncertainty_class = uncertainty_class
         self.uncertainty_kwargs = uncertainty_kwargs
         self.challenger_kwargs = challenger_kwargs or {}
+        if callable(decay) and decay_kwargs:
+            raise ValueError(f"decay_kwargs {decay_kwargs} are for decays by name, but `decay` is a function, {decay!r}.")
         self.decay = make_decay(decay, **(decay_kwargs or {}))
         self.unit = unit
         self.segment_length = segment_length
@@ -182,7 +185,10 @@ class ChallengerCallback(BaseCallback):
     def _on_training_start(self) -> None:
         model = self.model
         assert self.challenger is not None and isinstance(model, OffPolicyAlgorithm)
+        taken = self.buffer.has_challenger  # of this very learn()
         self._detach()
+        if taken:
+            raise ValueError("There are two ChallengerCallbacks in this learn(): a player has one challenger. Leave one out.")
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
@@ -422,14 +428,15 @@ def without_exploration(env: VecEnv | None) -> VecEnv:
     return env
 
 
+def _features_extractors(model: OffPolicyAlgorithm) -> list[th.nn.Module]:
+    modules = (getattr(model, name, None) for name in ("policy", "actor", "critic"))
+    extractors = (getattr(module, "features_extractor", None) for module in modules)
+    return [extractor for extractor in extractors if extractor is not None]
+
+
 def _player_keys(model: OffPolicyAlgorithm) -> tuple[str, ...] | None:
     """Keys that P's features extractors read, where they tell; images that only C looks at need not be moved for P."""
-    extractors = [
-        module.features_extractor
-        for module in (getattr(model, name, None) for name in ("policy", "actor", "critic"))
-        if module is not None and getattr(module, "features_extractor", None) is not None
-    ]
-    keys = [getattr(extractor, "player_keys", None) for extractor in extractors]
+    keys = [getattr(extractor, "player_keys", None) for extractor in _features_extractors(model)]
     if not keys or any(read is None for read in keys):
         return None
     wanted = set().union(*keys)  # type: ignore[arg-type]
@@ -456,6 +463,15 @@ def _check_model(model: Any) -> None:
             f"ChallengerCallback needs a CPMBuffer, but {name} has a {type(model.replay_buffer).__name__}: make it with "
             f'{name}("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)'
         )
+    given = model.replay_buffer.player_keys
+    for extractor in _features_extractors(model) if given is not None else ():
+        reads = extractor.extractors if isinstance(extractor, CombinedExtractor) else getattr(extractor, "player_keys", ())
+        missing = sorted(set(reads) - set(given or ()))
+        if missing:
+            raise ValueError(
+                f"The buffer's player_keys {list(given or ())} lack {missing}, which the player's {type(extractor).__name__} "
+                "reads: add them, or leave `player_keys` out of replay_buffer_kwargs."
+            )
 
 
 def _original_space(model: BaseAlgorithm) -> spaces.Dict:

@@ -40,14 +40,16 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
     Exploration probability epsilon as a function of the remaining progress.
 
     :param decay: ``"constant"``, ``"linear"``, ``"exponential"``, ``"inverse_time"``, ``"cosine"``, ``"logistic"``, or a
-        function from remaining progress (1 to 0) to epsilon, which is then used as it is
+        function from remaining progress (1 to 0) to epsilon, which is then used as it is, without the other arguments
     :param start: epsilon that the decay comes from
     :param floor: epsilon that the decay goes to; the report wants it above zero [4.2]
     :param rate: steepness of exponential, inverse-time and logistic decay
     :return: the schedule
-    :raises ValueError: for an unknown name, with the nearest, and for values that cannot work
+    :raises ValueError: for an unknown name, with the nearest, and for values that cannot work, those of a function included
     """
     if callable(decay):
+        for progress in (1.0, 0.5, 0.0):
+            check(f"`decay` at the remaining progress {progress}", decay(progress), SHARE)
         return decay
     if not isinstance(decay, str) or decay not in _DECAYS:
         raise ValueError(

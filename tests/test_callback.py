@@ -352,6 +352,25 @@ def test_an_exception_of_another_callback_leaves_nothing_behind():
     assert callback.explored_share == 1.0 and model.env is env
 
 
+def test_one_challenger_per_learn():
+    model = make_model()
+    with pytest.raises(ValueError, match="two ChallengerCallbacks"):
+        model.learn(200, callback=[make_callback(), make_callback()])
+    assert model.env is without_exploration(model.env)
+    model.learn(200, callback=make_callback())
+
+
+def test_a_function_as_decay_takes_no_arguments_for_decays_by_name():
+    with pytest.raises(ValueError, match="are for decays by name"):
+        make_callback(decay=lambda remaining: 0.5 * remaining, decay_kwargs=dict(start=0.5))
+
+
+def test_player_keys_that_the_player_cannot_do_without():
+    model = make_model(toy(keys=("pointcloud", "state")), buffer_kwargs=dict(player_keys=["state"]))
+    with pytest.raises(ValueError, match=r"lack \['pointcloud'\], which the player's CombinedExtractor reads"):
+        model.learn(200, callback=make_callback())
+
+
 def test_an_exception_keeps_no_model_alive():
     """SB3 tells no callback of it, so the handler of Ctrl-C stays: of that there may be many in a notebook."""
     before, buffers = signal.getsignal(signal.SIGINT), []

@@ -49,6 +49,9 @@ def test_decays_by_hand():
         dict(rate=0.0),
         dict(rate="fast"),
         dict(decay=["linear"]),
+        dict(decay=lambda remaining: 2.0 * remaining),
+        dict(decay=lambda remaining: float("nan")),
+        dict(decay=lambda remaining: None),
     ],
 )
 def test_bad_decays(kwargs):
