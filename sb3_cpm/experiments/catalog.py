@@ -259,9 +259,9 @@ _ALL = (
         "not in the report, whose own two CPM agents are handicapped: its world model, and its few updates of the player",
         (REPORT, SIMPLE, SAC_CLOUD),
         "curves",
-        replace(_FULL, cost="7 to 10 CPU hours per run, less with a GPU"),
+        replace(_FULL, cost="5 to 13 hours per run on a core, less with a GPU"),
         Plan((TOY,), 750, 250, 5, 1, {"sac": {"learning_starts": 200, "batch_size": 64}}, cost="5 minutes on 2 cores"),
-        short=replace(_SHORT, cost="10 to 70 CPU minutes per run, by agent and processor"),
+        short=replace(_SHORT, cost="20 to 120 CPU minutes per run, by agent and processor"),
     ),
     Experiment(
         "controllers",
