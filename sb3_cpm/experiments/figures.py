@@ -35,6 +35,10 @@ USUAL_COLOURS = {
     "CPM high exploration": BLUE,
     "CPM simple": ORANGE,
     "Dreamer": GREEN,
+    "PPO point cloud": PURPLE,
+    "PPO RGBD": RED,
+    "SAC point cloud": GREY,
+    "CPM report": PINK,
 }
 LEGEND_COLUMNS = 4
 #: Columns of evaluations.csv with the words for them.
