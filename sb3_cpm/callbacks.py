@@ -464,12 +464,14 @@ def _check_model(model: Any) -> None:
             f'{name}("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)'
         )
     given = model.replay_buffer.player_keys
-    for extractor in _features_extractors(model) if given is not None else ():
+    if given is None:
+        return
+    for extractor in _features_extractors(model):
         reads = extractor.extractors if isinstance(extractor, CombinedExtractor) else getattr(extractor, "player_keys", ())
-        missing = sorted(set(reads) - set(given or ()))
+        missing = sorted(set(reads) - set(given))
         if missing:
             raise ValueError(
-                f"The buffer's player_keys {list(given or ())} lack {missing}, which the player's {type(extractor).__name__} "
+                f"The buffer's player_keys {list(given)} lack {missing}, which the player's {type(extractor).__name__} "
                 "reads: add them, or leave `player_keys` out of replay_buffer_kwargs."
             )
 

@@ -609,6 +609,19 @@ def _space(entry: Mapping[str, Any]) -> spaces.Box:
     return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)
 
 
+def check_uncertainties(preset: Mapping[str, Any]) -> None:
+    """
+    :param preset: a complete one
+    :raises ValueError: for classes and arguments in its entry 'uncertainty' that there are not, with the nearest
+    """
+    where = "Preset entry 'uncertainty'"
+    # a class of one's own has its module in its name, and may take its arguments in any way
+    known = {name: arguments for name, arguments in preset["uncertainty"].items() if "." not in name}
+    check_names(where, known, UNCERTAINTY_CLASSES)
+    for name, arguments in known.items():
+        check_arguments(f"{where}, {name}", arguments, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
+
+
 def choose_uncertainty(
     kind: str | type[Uncertainty], kwargs: Mapping[str, Any] | None, preset: Mapping[str, Any]
 ) -> tuple[str, type[Uncertainty], dict[str, Any]]:
@@ -619,12 +632,7 @@ def choose_uncertainty(
     :return: its name in checkpoints, the class, and its arguments: the preset's with ``kwargs`` on top
     :raises ValueError: for names that there are not, with the nearest, also of arguments in the preset
     """
-    where = "Preset entry 'uncertainty'"
-    # a class of one's own has its module in its name, and may take its arguments in any way
-    known = {name: arguments for name, arguments in preset["uncertainty"].items() if "." not in name}
-    check_names(where, known, UNCERTAINTY_CLASSES)
-    for name, arguments in known.items():
-        check_arguments(f"{where}, {name}", arguments, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
+    check_uncertainties(preset)
     if isinstance(kind, str):
         if kind not in UNCERTAINTY_CLASSES:
             raise ValueError(

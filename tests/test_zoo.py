@@ -303,6 +303,7 @@ def test_files_that_are_no_configurations(text: str, message: str, tmp_path: Pat
     [
         ("dreamer", {"preset": "defalt"}, "Did you mean 'default'"),
         ("dreamer", {"preset": {"uncertainty": {"plan2explor": {}}}}, "Did you mean 'plan2explore'"),
+        ("dreamer", {"preset": {"uncertainty": {"rnd": {"unit": 3}}}, "start_from": "explorer.zip"}, "Did you mean 'units'"),
         ("dreamer", {"replay_buffer_kwargs": {"memap_dir": "d"}}, "replay_buffer_kwargs: .*Did you mean 'memmap_dir'"),
         ("plan2explore", {"uncertainty_class": "rmd"}, "Did you mean 'rnd'"),
         ("plan2explore", {"uncertainty_kwargs": {"head": 3}}, "uncertainty_kwargs: .*Did you mean 'heads'"),

@@ -24,7 +24,7 @@ from sb3_cpm.arguments import argument_names, check_arguments, check_names, near
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.challenger import choose_uncertainty
+from sb3_cpm.challenger import check_uncertainties, choose_uncertainty
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
@@ -241,7 +241,9 @@ def _check_world_model(given: Mapping[str, Any], where: str) -> None:
         preset = make_preset(given.get("preset") or "default")
         # that of the one to start from is not known here
         kind = given.get("uncertainty_class") or (None if given.get("start_from") else "plan2explore")
-        if kind is not None:
+        if kind is None:
+            check_uncertainties(preset)
+        else:
             choose_uncertainty(kind, given.get("uncertainty_kwargs"), preset)
 
 
