@@ -27,6 +27,7 @@ from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modu
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imagination
 from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, check_storable, read_file, write_file
 from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
+from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.observations import Inputs, ObservationSpec, check_action_space, to_tensor
 from sb3_cpm.world_model.open_loop import OpenLoop, open_loop
@@ -383,7 +384,9 @@ class Challenger:
         return start.select(place % n), (place < n) * (len(place) / n)
 
     def _imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
-        return self._novelty(Transitions(imagined.feats, imagined.actions, imagined.next_stochs, imagined.next_deters))
+        stoch = self.world_model.latent.size
+        next_stoch, next_deter = imagined.next_feats[..., :stoch], imagined.next_feats[..., stoch:]
+        return self._novelty(Transitions(imagined.feats, imagined.actions, next_stoch, next_deter))
 
     def _novelty(self, transitions: Transitions) -> torch.Tensor:
         """:raises ValueError: unless the uncertainty gives a number per transition: others might be broadcast unnoticed"""
@@ -396,7 +399,8 @@ class Challenger:
         return novelty
 
     def _imagined_reward(self, imagined: Imagination) -> torch.Tensor:
-        return self.world_model.reward(imagined.next_feats)
+        with frozen(self.world_model.reward_head):
+            return self.world_model.reward(imagined.next_feats)
 
     def _tensor(self, array: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return to_tensor(array, self.device).to(dtype)

@@ -69,6 +69,8 @@ ZOO_SDE = Contender(
         "gradient_steps": 32,
     },
 )
+PINK = Contender("SAC, pink noise", "sac", {"policy": "sb3_cpm.zoo.pink_noise.PinkNoisePolicy"})
+CPM_RND = Contender("CPM-SAC, RND", "cpm_sac", challenger(uncertainty_class="rnd"))
 DREAMER = Contender("Dreamer", "dreamer")
 PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
 PPO_RGBD = Contender("PPO RGBD", "ppo_rgbd")
@@ -150,6 +152,16 @@ _ALL = (
             cost="1 (SAC) to 4 CPU minutes per run, by processor",
         ),
         Plan((MOUNTAINCAR,), 4_000, 1_000, 3, 2, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "exploration",
+        "",
+        "MountainCarContinuous-v0: how soon the reward is found",
+        "not in the report: explorers beside each other on seeds that nothing was chosen on",
+        (SAC, CPM, CPM_RND, PLAN2EXPLORE, ZOO_SDE, PINK),
+        "curves",
+        Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 10, {}, "1 (SAC) to 3 CPU minutes per run, by processor", 10),
+        Plan((MOUNTAINCAR,), 2_000, 1_000, 3, 1, {}, "1 minute on 2 cores", 10),
     ),
     Experiment(
         "mountaincar-parts",

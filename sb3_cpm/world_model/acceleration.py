@@ -102,6 +102,11 @@ def compile_modules(modules: Iterable[nn.Module], device: torch.device) -> bool:
     return True
 
 
+def is_compiled(module: nn.Module) -> bool:
+    """Whether :func:`compile_modules` has had a module."""
+    return module._compiled_call_impl is not None
+
+
 @functools.cache
 def why_not_compile(device_type: str) -> str:
     """:return: the error of compiling something small on such a device, empty if that works; tried once per process"""

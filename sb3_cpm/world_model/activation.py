@@ -46,6 +46,18 @@ def elu_gradient_(gradient: torch.Tensor, result: torch.Tensor) -> torch.Tensor:
     return torch.ops.aten.elu_backward.grad_input(gradient, 1.0, 1.0, 1.0, True, result, grad_input=gradient)
 
 
+def tanh_(values: torch.Tensor) -> torch.Tensor:
+    """
+    tanh in place, without gradient: by a sigmoid on AMD's processors, where MKL's takes five times as long.
+
+    :param values: any shape; overwritten
+    :return: the same tensor
+    """
+    if not (is_amd() and is_plain(values)):
+        return values.tanh_()
+    return values.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
+
+
 def is_faster(values: torch.Tensor) -> bool:
     """Whether values are many, lie in memory without gaps, and are plain, on a processor where it has been measured."""
     return (

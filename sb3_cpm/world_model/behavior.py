@@ -20,14 +20,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from sb3_cpm.world_model.acceleration import mixed_precision
-from sb3_cpm.world_model.distributions import TruncatedNormal
+from sb3_cpm.world_model.acceleration import is_compiled, is_plain, mixed_precision
+from sb3_cpm.world_model.by_hand import Returns, through
+from sb3_cpm.world_model.distributions import GaussianLatent, TruncatedNormal
+from sb3_cpm.world_model.dream import Dream, Settings
 from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
 from sb3_cpm.world_model.one_hot import OneHot
 from sb3_cpm.world_model.optimizer import Gradients, Optimizer
-from sb3_cpm.world_model.rssm import LatentState
+from sb3_cpm.world_model.rssm import RSSM, LatentState
 from sb3_cpm.world_model.world_model import WorldModel
 
 
@@ -39,16 +41,12 @@ class Imagination(NamedTuple):
     :param actions: shape ``(H, n, action_dim)``, within [-1, 1]
     :param entropies: of the actor in these states, shape ``(H, n)``
     :param next_feats: latents of the states 1..H, in which the actions arrive, shape ``(H, n, feat_dim)``
-    :param next_stochs: their stochastic part, shape ``(H, n, stoch_size)``
-    :param next_deters: their deterministic part, shape ``(H, n, deter_size)``
     """
 
     feats: torch.Tensor
     actions: torch.Tensor
     entropies: torch.Tensor
     next_feats: torch.Tensor
-    next_stochs: torch.Tensor
-    next_deters: torch.Tensor
 
 
 RewardFunction = Callable[[Imagination], torch.Tensor]
@@ -81,15 +79,12 @@ class Actor(nn.Module):
     :param one_hot: which of the latent's numbers are one-hot vectors
     """
 
-    min_std = 0.1
-
     def __init__(self, feat_dim: int, action_dim: int, layers: int, units: int, one_hot: OneHot | None = None) -> None:
         super().__init__()
         self.net = MLP(feat_dim, layers, units, 2 * action_dim, one_hot)
 
     def forward(self, feat: torch.Tensor) -> TruncatedNormal:
-        mean, raw = self.net(feat).float().chunk(2, dim=-1)
-        return TruncatedNormal(torch.tanh(mean), 2.0 * torch.sigmoid(0.5 * raw) + self.min_std)
+        return TruncatedNormal.of_outputs(self.net(feat))
 
 
 class ActorCritic(nn.Module):
@@ -139,6 +134,12 @@ class ActorCritic(nn.Module):
         :param world_model: supplies the dynamics; its weights get no gradient
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """
+        if self._learns_by_hand(world_model, start):
+            settings = Settings(self.preset["horizon"], self.preset["actor_input_gradient"])
+            layers = [layer for layer in self.actor.net if isinstance(layer, nn.Linear)]
+            actor = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+            here, there, acts, outputs = Dream.apply(settings, world_model.rssm.dynamics(), start.deter, start.stoch, *actor)
+            return Imagination(here, acts, TruncatedNormal.of_outputs(outputs).entropy(), there)
         states, feats, actions, policies = [start], [start.feat], [], []
         for _ in range(self.preset["horizon"]):
             seen = feats[-1] if self.preset["actor_input_gradient"] else feats[-1].detach()
@@ -153,8 +154,18 @@ class ActorCritic(nn.Module):
             torch.stack(actions),
             policy.entropy(),
             torch.stack(feats[1:]),
-            torch.stack([state.stoch for state in states[1:]]),
-            torch.stack([state.deter for state in states[1:]]),
+        )
+
+    def _learns_by_hand(self, world_model: WorldModel, start: LatentState) -> bool:
+        """
+        Whether gradients are computed by hand (:mod:`~sb3_cpm.world_model.dream`, :mod:`~sb3_cpm.world_model.by_hand`): with
+        Gaussian latents, in plain float32 on a CPU. They are the same as autograd's.
+        """
+        return (
+            is_plain(start.deter)
+            and isinstance(world_model.rssm, RSSM)
+            and isinstance(world_model.rssm.latent, GaussianLatent)
+            and not any(map(is_compiled, (world_model.rssm, self.actor.net, self.critic)))
         )
 
     def losses(
@@ -174,16 +185,22 @@ class ActorCritic(nn.Module):
         :param optimizers: those of :meth:`make_optimizers`
         :param share: how much each start counts, 1 on average, shape ``(n,)``; None where all count alike
         """
-        amp = mixed_precision(start.deter.device, self.preset["amp"])
-        # what the actor learns goes through world model and slow critic, which learn nothing here
-        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"), frozen(world_model, self.target_critic):
+        amp, by_hand = mixed_precision(start.deter.device, self.preset["amp"]), self._learns_by_hand(world_model, start)
+        # what the actor learns goes through world model and slow critic, which learn nothing here; by hand nobody asks
+        constant = () if by_hand else (world_model, self.target_critic)
+        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"), frozen(*constant):
             with amp:
                 imagined = self.imagine(world_model, start)
             rewards = reward(imagined)
-            with amp:
-                discounts = self.preset["gamma"] * world_model.continue_probability(imagined.next_feats)
-                values = self.target_critic(imagined.next_feats).float().squeeze(-1)
-            returns = lambda_returns(rewards, values, discounts, self.preset["lambda_"])
+            gamma, lambda_ = self.preset["gamma"], self.preset["lambda_"]
+            if by_hand:
+                heads = (self.target_critic, world_model.continue_head)
+                returns, values, discounts = Returns.apply(rewards, imagined.next_feats, *heads, gamma, lambda_)
+            else:
+                with amp:
+                    discounts = gamma * world_model.continue_probability(imagined.next_feats)
+                    values = self.target_critic(imagined.next_feats).float().squeeze(-1)
+                returns = lambda_returns(rewards, values, discounts, lambda_)
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
         reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
         share = torch.ones_like(reached[0]) if share is None else share
@@ -192,13 +209,36 @@ class ActorCritic(nn.Module):
         objective, entropies = self._objective(imagined, returns, values)
         actor_loss = -(weight * (objective + self.preset["entropy_scale"] * entropies)).mean()
         actor_gradients = optimizers[f"{self.name}_actor"].gradients(actor_loss)
-        with amp:
-            predicted = self.critic(imagined.feats.detach()).float().squeeze(-1)
-        critic_loss = (weight * 0.5 * (predicted - returns.detach()).square()).mean()
-        critic_gradients = optimizers[f"{self.name}_critic"].gradients(critic_loss)
+        critic_loss, critic_gradients = self._critic_loss(imagined, returns.detach(), weight, optimizers, by_hand)
         means = {"imagined_reward": rewards, "imagined_return": returns, "entropy": entropies}
         metrics = {name: (share * value.detach()).mean() for name, value in means.items()}
         return BehaviorLosses(actor_loss.detach(), actor_gradients, critic_loss.detach(), critic_gradients, metrics)
+
+    def _critic_loss(
+        self,
+        imagined: Imagination,
+        returns: torch.Tensor,
+        weight: torch.Tensor,
+        optimizers: Mapping[str, Optimizer],
+        by_hand: bool,
+    ) -> tuple[torch.Tensor, Gradients]:
+        """
+        :param imagined: what the actor did
+        :param returns: of each action, shape ``(H, n)``
+        :param weight: how much each counts, shape ``(H, n)``
+        :param optimizers: those of :meth:`make_optimizers`
+        :param by_hand: without autograd
+        """
+        feats = imagined.feats.detach()
+        if by_hand:
+            judged = through(self.critic, feats)
+            error = judged.output.view_as(returns) - returns
+            loss = (weight * 0.5 * error.square()).mean()
+            return loss, judged.to_parameters((weight * error / error.numel()).view(-1, 1))
+        with mixed_precision(feats.device, self.preset["amp"]):
+            predicted = self.critic(feats).float().squeeze(-1)
+        loss = (weight * 0.5 * (predicted - returns).square()).mean()
+        return loss, optimizers[f"{self.name}_critic"].gradients(loss)
 
     def step(self, losses: BehaviorLosses, optimizers: Mapping[str, Optimizer]) -> dict[str, torch.Tensor]:
         """

@@ -95,6 +95,17 @@ def multiply(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None =
     return _multiply(left, right) if out is None else out.copy_(_multiply(left, right))
 
 
+def weight_gradient(gradient: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+    """
+    Gradient of a layer's weight; no gradients of its own.
+
+    :param gradient: of the layer's output, shape ``(n, size_out)``
+    :param inputs: shape ``(n, size_in)``
+    :return: shape ``(size_out, size_in)``
+    """
+    return _multiply(gradient.t(), inputs.t()) if is_faster(inputs, gradient.shape[-1]) else gradient.t() @ inputs
+
+
 def add_product_(total: torch.Tensor, left: torch.Tensor, right: torch.Tensor) -> None:
     """Add ``left @ right.T`` to ``total``; as :func:`multiply`."""
     if prefers_onednn():

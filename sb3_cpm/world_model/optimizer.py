@@ -1,5 +1,6 @@
 """Adam with what Dreamer adds to it: gradient clipping, decoupled weight decay, and a refusal to step on NaN."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -52,18 +53,19 @@ class Optimizer:
         :return: the gradient's norm before clipping
         :raises RuntimeError: if loss or gradient are not finite; the parameters are then still the good ones
         """
-        if not torch.isfinite(loss):
+        if not math.isfinite(loss.item()):
             raise RuntimeError(f"The {self.name} loss became {loss.item()}. {ADVICE}")
         gradients = self.gradients(loss) if gradients is None else gradients
         for parameter, gradient in zip(self.parameters, gradients, strict=True):
             parameter.grad = gradient
         used = [gradient for gradient in gradients if gradient is not None]
         norm = nn.utils.get_total_norm(used)
-        if not torch.isfinite(norm):
+        size = norm.item()
+        if not math.isfinite(size):
             self.adam.zero_grad(set_to_none=True)
-            raise RuntimeError(f"The gradient of the {self.name} loss ({loss.item():.4g}) became {norm.item()}. {ADVICE}")
-        if norm > self.clip:
-            torch._foreach_mul_(used, self.clip / (norm + 1e-6))
+            raise RuntimeError(f"The gradient of the {self.name} loss ({loss.item():.4g}) became {size}. {ADVICE}")
+        if size > self.clip:
+            torch._foreach_mul_(used, self.clip / (size + 1e-6))
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         if self.weight_decay and self.decayed:

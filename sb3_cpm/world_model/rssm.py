@@ -18,7 +18,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_cpm.world_model.distributions import Latent
+from sb3_cpm.world_model.acceleration import is_compiled
+from sb3_cpm.world_model.distributions import GaussianLatent, Latent
+from sb3_cpm.world_model.dream import Dynamics
 from sb3_cpm.world_model.linear import Linear
 from sb3_cpm.world_model.networks import MLP, GRUCell
 from sb3_cpm.world_model.one_hot import OneHotLinear
@@ -147,7 +149,7 @@ class RSSM(nn.Module):
 
     def _trains_by_hand(self, embed_in: torch.Tensor) -> bool:
         """Where there is a gradient to compute, and torch.compile does not have the step."""
-        return embed_in.requires_grad and self._compiled_call_impl is None
+        return embed_in.requires_grad and not is_compiled(self)
 
     def _scan(
         self,
@@ -193,3 +195,20 @@ class RSSM(nn.Module):
         if deterministic:
             return LatentState(deter, self.latent.mode(stats), stats)
         return LatentState(deter, self.latent.sample(stats, self.latent.noise(len(deter), like=deter)), stats)
+
+    def dynamics(self) -> Dynamics:
+        """What :meth:`imagine_step` is made of, for :class:`~sb3_cpm.world_model.dream.Dream`."""
+        assert isinstance(self.latent, GaussianLatent)
+        gates, hidden = self.gru.gates.weight, self.input_action.out_features
+        hidden_layer, _, output_layer = self.prior_net
+        return Dynamics(
+            self.latent,
+            torch.cat((self.input_action.weight, self.input_stoch.weight), dim=1),
+            self.input_stoch.bias,
+            torch.cat((gates[:, hidden:], gates[:, :hidden]), dim=1),  # the cell itself reads its input first
+            self.gru.norm.weight,
+            self.gru.norm.bias,
+            self.gru.norm.eps,
+            self.gru.update_bias,
+            ((hidden_layer.weight, hidden_layer.bias), (output_layer.weight, output_layer.bias)),
+        )

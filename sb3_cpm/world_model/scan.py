@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
+from sb3_cpm.world_model.activation import tanh_
 from sb3_cpm.world_model.distributions import Latent
 
 
@@ -71,28 +72,36 @@ class Scan(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         layers, latent = Weights(*weights), settings.latent
         hidden, size = actions_in.shape[-1], deter.shape[-1]
-        resets = rows_with_resets(is_first)
+        resets, first = rows_with_resets(is_first), is_first.unbind(0)
         inputs = actions_in.new_empty(*actions_in.shape[:2], hidden + size)  # of the gates: a and h, side by side
-        rows: list[tuple[torch.Tensor, ...]] = []
-        for t, reset in enumerate(resets):
-            if reset:
-                deter, stoch = deter.masked_fill(is_first[t], 0.0), stoch.masked_fill(is_first[t], 0.0)
-            inputs[t, :, :hidden] = F.elu_(torch.addmm(actions_in[t], stoch, layers.stoch.t()))
-            inputs[t, :, hidden:] = deter
-            products = inputs[t] @ layers.gates.t()
-            gates, mean, spread = torch.native_layer_norm(
-                products, (3 * size,), layers.norm, layers.norm_bias, settings.norm_eps
-            )
-            before, (reset_gate, candidate, update) = stoch, gates.chunk(3, dim=-1)
-            candidate = torch.tanh(torch.sigmoid(reset_gate) * candidate)
-            deter = torch.lerp(deter, candidate, torch.sigmoid(update + settings.update_bias))
-            posterior = F.elu_(torch.addmm(embed_in[t], deter, layers.deter.t()))
-            stats = torch.addmm(layers.out_bias, posterior, layers.out.t())
-            stoch = latent.sample(stats, noise[t])
-            rows.append((deter, stoch, stats, before, products, gates, mean, spread, posterior))
-        deters, stochs, all_stats, *rest = (torch.stack(part) for part in zip(*rows, strict=True))
+        inner, memory = (part.unbind(0) for part in inputs.split((hidden, size), dim=-1))
+        posteriors = torch.empty_like(embed_in)
+        # taking a row of a tensor, or a transpose, costs as much as a small operation: each is taken once
+        rows = [part.unbind(0) for part in (actions_in, embed_in, inputs, posteriors, noise)]
+        from_stoch, to_gates, from_deter, to_stats = (
+            weight.t() for weight in (layers.stoch, layers.gates, layers.deter, layers.out)
+        )
+        norm_bias = layers.norm_bias.clone()
+        norm_bias[2 * size :] += settings.update_bias
+        kept: list[tuple[torch.Tensor, ...]] = []
+        for t, (action_in, embedding, both, posterior, chance) in enumerate(zip(*rows, strict=True)):
+            if resets[t]:
+                deter, stoch = deter.masked_fill(first[t], 0.0), stoch.masked_fill(first[t], 0.0)
+            before = stoch
+            F.elu_(torch.addmm(action_in, stoch, from_stoch, out=inner[t]))
+            memory[t].copy_(deter)
+            products = both @ to_gates
+            gates, mean, spread = torch.native_layer_norm(products, (3 * size,), layers.norm, norm_bias, settings.norm_eps)
+            opened = torch.sigmoid(gates)  # reset and update; what becomes of the candidate in between is not looked at
+            bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])
+            deter = torch.lerp(deter, bounded, opened[:, 2 * size :])
+            F.elu_(torch.addmm(embedding, deter, from_deter, out=posterior))
+            stats = torch.addmm(layers.out_bias, posterior, to_stats)
+            stoch = latent.sample(stats, chance)
+            kept.append((deter, stoch, stats, before, products, mean, spread, gates, opened, bounded))
+        deters, stochs, all_stats, *rest = (torch.stack(part) for part in zip(*kept, strict=True))
         ctx.settings, ctx.resets = settings, resets
-        ctx.save_for_backward(noise, is_first, deters, all_stats, inputs, *rest, *weights)
+        ctx.save_for_backward(noise, is_first, deters, all_stats, inputs, posteriors, *rest, *weights)
         return deters, stochs, all_stats
 
     @staticmethod
@@ -100,44 +109,54 @@ class Scan(torch.autograd.Function):
     def backward(
         ctx: Any, of_deters: torch.Tensor, of_stochs: torch.Tensor, of_stats: torch.Tensor
     ) -> tuple[torch.Tensor | None, ...]:
-        noise, is_first, deters, stats, inputs, befores, products, gates, mean, spread, posteriors, *rest = ctx.saved_tensors
-        layers, latent = Weights(*rest), ctx.settings.latent
+        noise, is_first, deters, all_stats, inputs, posteriors, *rest = ctx.saved_tensors
+        befores, products, mean, spread, gates, opened, bounded, *weights = rest
+        layers, latent = Weights(*weights), ctx.settings.latent
         size = deters.shape[-1]
         hidden = inputs.shape[-1] - size
-        latent_slopes = latent.slopes(stats, noise)
+        passed = opened[..., :size], gates[..., size : 2 * size], bounded, opened[..., 2 * size :]
+        slopes_of_gates, remembered = gate_slopes(*passed, inputs[..., hidden:])
         elu_a, elu_p = inputs[..., :hidden].clamp(max=0.0) + 1.0, posteriors.clamp(max=0.0) + 1.0
-        gate_slopes, kept = _gate_slopes(gates, inputs[..., hidden:], ctx.settings.update_bias)
+        slopes_of_stats = latent.slopes(all_stats, noise)
+        norm = (layers.norm, layers.norm_bias)
+        g_all_stats, g_all_posteriors, g_all_gates, g_all_products, g_all_a = found = [
+            torch.empty_like(like) for like in (all_stats, posteriors, products, products, elu_a)
+        ]
+        rows = [
+            part.unbind(0)
+            for part in (of_deters, of_stochs, of_stats, slopes_of_stats, elu_p, slopes_of_gates, products, mean, spread)
+        ]
+        to_stats, to_posteriors, to_gates, to_products, to_a = (part.unbind(0) for part in found)
+        first, elus, keeps = is_first.unbind(0), elu_a.unbind(0), remembered.unbind(0)
 
-        carry_deter, carry_stoch = torch.zeros_like(deters[0]), torch.zeros_like(of_stochs[0])
-        found: list[tuple[torch.Tensor, ...]] = []
-        for t in reversed(range(len(deters))):
-            g_stats = of_stats[t] + latent.pull_back(latent_slopes[t], of_stochs[t] + carry_stoch)
-            g_posterior = (g_stats @ layers.out).mul_(elu_p[t])
-            g_deter = torch.addmm(of_deters[t] + carry_deter, g_posterior, layers.deter)
-            g_gates = (gate_slopes[t] * g_deter.unsqueeze(1)).flatten(1)
-            g_products = _norm_backward(g_gates, products[t], mean[t], spread[t], layers, (True, False, False))[0]
-            g_inputs = g_products @ layers.gates
-            g_a = g_inputs[:, :hidden] * elu_a[t]
-            carry_deter = torch.addcmul(g_inputs[:, hidden:], g_deter, kept[t])
-            carry_stoch = g_a @ layers.stoch
+        g_deter, g_stoch = torch.zeros_like(deters[0]), torch.zeros_like(of_stochs[0])
+        for t, (of_deter, of_stoch, of_stat, slope, elu, slope_of_gates, product, average, deviation) in reversed(
+            list(enumerate(zip(*rows, strict=True)))
+        ):
+            g_stats = torch.add(of_stat, latent.pull_back(slope, of_stoch + g_stoch), out=to_stats[t])
+            g_posterior = torch.mm(g_stats, layers.out, out=to_posteriors[t]).mul_(elu)
+            g_deter = torch.addmm(of_deter + g_deter, g_posterior, layers.deter)
+            torch.mul(slope_of_gates, g_deter.unsqueeze(1), out=to_gates[t].unflatten(-1, (3, size)))
+            g_products = norm_backward(to_gates[t], product, average, deviation, *norm, (True, False, False))[0]
+            to_products[t].copy_(g_products)
+            g_inner, g_memory = (g_products @ layers.gates).split((hidden, size), dim=-1)
+            g_a = torch.mul(g_inner, elus[t], out=to_a[t])
+            g_deter = g_memory.addcmul_(g_deter, keeps[t])
+            g_stoch = g_a @ layers.stoch
             if ctx.resets[t]:
-                carry_deter.masked_fill_(is_first[t], 0.0)
-                carry_stoch.masked_fill_(is_first[t], 0.0)
-            found.append((g_stats, g_posterior, g_gates, g_products, g_a))
-        all_stats, all_posteriors, all_gates, all_products, all_a = (
-            torch.stack(part) for part in zip(*reversed(found), strict=True)
-        )
-        _, g_norm, g_norm_bias = _norm_backward(all_gates, products, mean, spread, layers, (False, True, True))
+                g_deter.masked_fill_(first[t], 0.0)
+                g_stoch.masked_fill_(first[t], 0.0)
+        _, g_norm, g_norm_bias = norm_backward(g_all_gates, products, mean, spread, *norm, (False, True, True))
         gradients = Weights(
-            _weight_gradient(all_a, befores),
-            _weight_gradient(all_products, inputs),
+            _weight_gradient(g_all_a, befores),
+            _weight_gradient(g_all_products, inputs),
             g_norm,
             g_norm_bias,
-            _weight_gradient(all_posteriors, deters),
-            _weight_gradient(all_stats, posteriors),
-            all_stats.sum((0, 1)),
+            _weight_gradient(g_all_posteriors, deters),
+            _weight_gradient(g_all_stats, posteriors),
+            g_all_stats.sum((0, 1)),
         )
-        return None, None, None, None, None, all_a, all_posteriors, *gradients
+        return None, None, None, None, None, g_all_a, g_all_posteriors, *gradients
 
 
 def rows_with_resets(is_first: torch.Tensor) -> list[bool]:
@@ -149,35 +168,36 @@ def rows_with_resets(is_first: torch.Tensor) -> list[bool]:
     return [True] * len(is_first) if is_first.is_cuda else is_first.flatten(1).any(dim=1).tolist()
 
 
-def _gate_slopes(gates: torch.Tensor, before: torch.Tensor, update_bias: float) -> tuple[torch.Tensor, torch.Tensor]:
+def gate_slopes(
+    reset: torch.Tensor, candidate: torch.Tensor, bounded: torch.Tensor, update: torch.Tensor, before: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """
-    Slopes of the new memory with respect to the gates and to the old memory, of all steps.
+    Slopes of a GRU's new memory with respect to its gates (after the layer norm) and to its old memory, of all steps.
 
-    :param gates: after the layer norm, shape ``(L, n, 3 * size)``
-    :param before: memory before the step, shape ``(L, n, size)``
+    :param reset: the reset gate, after its sigmoid, shape ``(L, n, size)``
+    :param candidate: before it is reset
+    :param bounded: tanh of the candidate once it is reset
+    :param update: the update gate, after its sigmoid
+    :param before: memory before the step
     :return: shapes ``(L, n, 3, size)`` and ``(L, n, size)``
     """
-    reset, candidate, update = gates.chunk(3, dim=-1)
-    reset, update = torch.sigmoid(reset), torch.sigmoid(update + update_bias)
-    bounded = torch.tanh(reset * candidate)
     inner = update * (1.0 - bounded.square())
     slopes = (inner * candidate * reset * (1.0 - reset), inner * reset, (bounded - before) * update * (1.0 - update))
     return torch.stack(slopes, dim=-2), 1.0 - update
 
 
-def _norm_backward(
+def norm_backward(
     gradient: torch.Tensor,
     inputs: torch.Tensor,
     mean: torch.Tensor,
     spread: torch.Tensor,
-    layers: Weights,
+    gain: torch.Tensor,
+    bias: torch.Tensor,
     wanted: tuple[bool, bool, bool],
 ) -> tuple[torch.Tensor, ...]:
     """Gradients of a layer norm's input, gain and bias."""
     shape = inputs.shape[-1:]
-    return torch.ops.aten.native_layer_norm_backward(
-        gradient, inputs, shape, mean, spread, layers.norm, layers.norm_bias, list(wanted)
-    )
+    return torch.ops.aten.native_layer_norm_backward(gradient, inputs, shape, mean, spread, gain, bias, list(wanted))
 
 
 def _weight_gradient(gradients: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
