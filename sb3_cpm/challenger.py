@@ -194,13 +194,21 @@ class Challenger:
         return LatentState(*(part[-1] for part in rows))
 
     @torch.no_grad()
-    def act(self, state: LatentState, deterministic: bool = False, behavior: str = "exploration") -> np.ndarray:
+    def act(
+        self,
+        state: LatentState,
+        deterministic: bool = False,
+        behavior: str = "exploration",
+        noise: torch.Tensor | None = None,
+    ) -> np.ndarray:
         """
         Actions of one of its behaviours.
 
         :param state: latent state, ``n`` columns
         :param deterministic: the policy's mode instead of a sample
         :param behavior: "exploration" or "task"
+        :param noise: standard normal numbers that the samples are made of, shape ``(n, action_dim)``, such as those of
+            :class:`~sb3_cpm.world_model.perseverance.CorrelatedNoise`; drawn anew where None
         :return: shape ``(n, action_dim)``, within [-1, 1]
         :raises ValueError: for a behaviour that it does not have
         """
@@ -210,7 +218,10 @@ class Challenger:
                 f"'train_{behavior}_behavior': True."
             )
         policy = self.behaviors[behavior].actor(state.feat)
-        return (policy.mode if deterministic else policy.rsample()).cpu().numpy()
+        if deterministic:
+            return policy.mode.cpu().numpy()
+        actions = policy.rsample() if noise is None else policy.at(torch.special.ndtr(noise))[0]
+        return actions.cpu().numpy()
 
     # ---- judging -----------------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from sb3_cpm.arguments import ABOVE_0, SHARE, check, check_each, nearest
 from sb3_cpm.buffers import EXECUTED_ACTION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 ExplorationUnit = Literal["step", "segment", "episode"]
 
@@ -131,6 +132,7 @@ class ExplorationVecEnv(VecEnvWrapper):
         # D holds observations as they were before VecNormalize, and so does C see them
         self._vec_normalize = unwrap_vec_normalize(venv)
         self._latent = challenger.initial_state(self.num_envs)
+        self._noise = CorrelatedNoise(challenger.preset["noise_memory"], challenger.action_dim, challenger.device)
         self._pending: list[list[_Row]] = [[] for _ in range(self.num_envs)]
         self._explores = np.zeros(self.num_envs, dtype=bool)
         self._unit_steps = np.zeros(self.num_envs, dtype=np.int64)  # since who acts was last drawn
@@ -212,7 +214,8 @@ class ExplorationVecEnv(VecEnvWrapper):
         if self.challenger.trained_updates == 0:
             return np.random.uniform(-1, 1, size=(len(envs), *self._low.shape)).astype(np.float32)
         self._catch_up(envs)
-        return self.challenger.act(self._latent.select(th.as_tensor(envs))).reshape(len(envs), *self._low.shape)
+        actions = self.challenger.act(self._latent.select(th.as_tensor(envs)), noise=self._noise.draw(envs))
+        return actions.reshape(len(envs), *self._low.shape)
 
     def _report(self, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """:return: the infos, with the action wherever C acted, in new dicts: environments may share theirs, or keep them"""
@@ -233,6 +236,7 @@ class ExplorationVecEnv(VecEnvWrapper):
     def _start_episode(self, env_idx: int, obs: dict[str, np.ndarray]) -> None:
         self._pending[env_idx].clear()  # what came before an is_first row doesn't matter
         self._unit_steps[env_idx] = 0
+        self._noise.restart(np.array([env_idx]))
         self._remember(env_idx, obs, np.zeros(self._low.shape, dtype=np.float32), is_first=True)
 
     def _remember(self, env_idx: int, obs: dict[str, np.ndarray], action: np.ndarray, is_first: bool) -> None:

@@ -60,7 +60,9 @@ REPORT: dict[str, Any] = {
     "actor_gradient": "dynamics",  # how actors learn: "dynamics", "reinforce" or "both"
     "reinforce_share": 0.9,  # share of REINFORCE in "both"
     "actor_input_gradient": True,  # whether returns also reach the actor through the latents that later actions depend on
-    "entropy_scale": 1e-4,  # reward for the actor's entropy
+    "entropy_scale": 1e-4,  # reward for the entropy of the task's actor
+    "exploration_entropy_scale": 1e-4,  # the same for the exploration actor
+    "noise_memory": 0.0,  # steps that the noise of exploring actions reaches back; 0 is white noise
     "actor_layers": 4,  # hidden layers
     "actor_units": 400,  # size of each of them
     "critic_layers": 3,  # hidden layers
@@ -135,6 +137,7 @@ _RULES: dict[str, Rule] = {
     **{key: integer(0) for key in REPORT if key.endswith("_layers")},  # an MLP may consist of its output layer
     **{key: integer(1) for key in ("cnn_depth", "cnn_layers", "horizon")},
     **{key: AT_LEAST_0 for key in REPORT if key.endswith(("_lr", "_scale"))},
+    "noise_memory": AT_LEAST_0,
     "sequence_length": integer(2),  # a transition has two rows
     "imagination_starts": Rule(f"None or {integer(1).words}", lambda value: value is None or integer(1).holds(value)),
     "latent": choice("gaussian", "categorical"),

@@ -108,7 +108,7 @@ def imagine(challenger: Challenger) -> LatentState:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_actor_learns_with_the_critic_zeroed_and_nobody_else_does(kind: str) -> None:
-    challenger = small(actor_gradient=kind, entropy_scale=0.0)
+    challenger = small(actor_gradient=kind, exploration_entropy_scale=0.0)
     exploration, start = challenger.exploration, imagine(challenger)
     with torch.no_grad():
         for parameter in exploration.target_critic.parameters():
@@ -128,7 +128,7 @@ def test_entropy_is_rewarded_by_its_scale(kind: str) -> None:
     spread = []
     for scale in (0.0, 1.0):
         torch.manual_seed(0)
-        challenger = small(actor_gradient=kind, entropy_scale=scale, actor_lr=3e-3)
+        challenger = small(actor_gradient=kind, exploration_entropy_scale=scale, actor_lr=3e-3)
         start = imagine(challenger)
         with torch.no_grad():
             for parameter in challenger.exploration.target_critic.parameters():
@@ -169,7 +169,7 @@ def test_starts_that_count_for_nothing_have_no_influence(kind: str) -> None:
 @pytest.mark.parametrize(("horizon", "same"), [(1, True), (3, False)])
 def test_the_gradient_through_the_actors_input(horizon: int, same: bool) -> None:
     """Concerns the actions after the first alone, and changes what the actor learns but not what it imagines."""
-    challenger = small(horizon=horizon, entropy_scale=0.0)
+    challenger = small(horizon=horizon, exploration_entropy_scale=0.0)
     found = []
     for through in (True, False):
         challenger.exploration.preset = {**challenger.exploration.preset, "actor_input_gradient": through}

@@ -38,6 +38,7 @@ from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
 from sb3_cpm.world_model.observations import check_action_space, unread
+from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 #: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
 _OF_CONSTRUCTOR = ("preset", "keys", "start_from", "uncertainty_class", "uncertainty_kwargs", "train_task_behavior")
@@ -121,6 +122,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self.pretrain_steps = pretrain_steps
         #: Recurrent state after the last action of ``learn()``; None before the first.
         self._state: RecurrentState | None = None
+        self._noise: CorrelatedNoise | None = None
         self._random_state: RandomState | None = None
         if _init_setup_model:
             self._setup_model()
@@ -226,13 +228,15 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None
         assert isinstance(self.action_space, spaces.Box)
         if self._state is None or len(self._state[0]) != n_envs:
-            self._state = self.policy.initial_state(n_envs)
+            self._state, self._noise = self.policy.initial_state(n_envs), self._make_noise()
+        if self._noise is not None:
+            self._noise.restart(np.flatnonzero(self._last_episode_starts))
         latent = self.policy.follow(self._last_obs, self._state, self._last_episode_starts)
         if self.num_timesteps < learning_starts:
             actions = np.array([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
         else:
-            scaled = self.policy.act(latent)
+            scaled = self.policy.act(latent, noise=None if self._noise is None else self._noise.draw(np.arange(n_envs)))
         if action_noise is not None:
             scaled = np.clip(scaled + np.reshape(action_noise(), (-1, scaled.shape[1])), -1.0, 1.0)
         if not np.isfinite(scaled).all():
@@ -241,6 +245,12 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         shaped = scaled.reshape(n_envs, *self.action_space.shape)
         # rounding must not leave the space
         return np.clip(self.policy.unscale_action(shaped), self.action_space.low, self.action_space.high), shaped
+
+    def _make_noise(self) -> CorrelatedNoise | None:
+        """What exploration is made of; a behaviour that is to solve the task has white noise, which it learns with."""
+        if self.behavior != "exploration":
+            return None
+        return CorrelatedNoise(self.challenger.preset["noise_memory"], self.challenger.action_dim, self.challenger.device)
 
     def _refuse_nan(self) -> None:
         assert self._last_obs is not None

@@ -132,13 +132,14 @@ class DreamerPolicy(BasePolicy):
         row = {key: np.asarray(value)[None] for key, value in as_dict(observations).items()}
         return self.challenger.follow(latent, row, action[None], episode_start[None], deterministic=deterministic)
 
-    def act(self, latent: LatentState, deterministic: bool = False) -> np.ndarray:
+    def act(self, latent: LatentState, deterministic: bool = False, noise: th.Tensor | None = None) -> np.ndarray:
         """
         :param latent: as :meth:`follow` gives it
         :param deterministic: the mode instead of a sample
+        :param noise: see :meth:`Challenger.act <sb3_cpm.challenger.Challenger.act>`
         :return: actions within [-1, 1], shape ``(n_envs, action_dim)``
         """
-        return self.challenger.act(latent, deterministic, self.behavior)
+        return self.challenger.act(latent, deterministic, self.behavior, noise)
 
     @staticmethod
     def recurrent_state(latent: LatentState, action: np.ndarray) -> RecurrentState:

@@ -103,6 +103,7 @@ class ActorCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.name, self.preset, self.one_hot = name, preset, one_hot
+        self.entropy_scale: float = preset["exploration_entropy_scale" if name == "exploration" else "entropy_scale"]
         self.actor = Actor(feat_dim, action_dim, preset["actor_layers"], preset["actor_units"], one_hot)
         self.critic = self._make_critic(feat_dim)
         self.target_critic = self.critic
@@ -207,7 +208,7 @@ class ActorCritic(nn.Module):
         weight = reached * share
 
         objective, entropies = self._objective(imagined, returns, values)
-        actor_loss = -(weight * (objective + self.preset["entropy_scale"] * entropies)).mean()
+        actor_loss = -(weight * (objective + self.entropy_scale * entropies)).mean()
         actor_gradients = optimizers[f"{self.name}_actor"].gradients(actor_loss)
         critic_loss, critic_gradients = self._critic_loss(imagined, returns.detach(), weight, optimizers, by_hand)
         means = {"imagined_reward": rewards, "imagined_return": returns, "entropy": entropies}
