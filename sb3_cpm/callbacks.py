@@ -341,6 +341,7 @@ class ChallengerCallback(BaseCallback):
         if proposal.artificial is not None:
             self.logger.record_mean("challenge/length", len(proposal.artificial.total))
             self.logger.record_mean("challenge/reward", proposal.artificial.total.mean())
+            self.logger.record_mean("challenge/reward_constant", proposal.artificial.constant)
             for term in REWARD_TERMS:
                 self.logger.record_mean(f"challenge/reward_{term}", getattr(proposal.artificial, term).mean())
 

@@ -276,7 +276,7 @@ def test_row_mix_with_evaluation_progress_bar_and_tensorboard(tmp_path):
     logger.close()
     header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
     names = {"rollout/exploration_rate", "challenger/world_model_loss", "challenger/exp_scale"}
-    names |= {f"challenge/{name}" for name in ("kept", "c_emb", "w3", "reward_memory", "acceptance_novel")}
+    names |= {f"challenge/{name}" for name in ("kept", "c_emb", "w3", "reward_memory", "reward_origin", "acceptance_novel")}
     assert names <= set(header)
     assert any(path.name.startswith("events.out.tfevents") for path in tmp_path.iterdir())
 

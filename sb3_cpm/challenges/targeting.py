@@ -66,19 +66,22 @@ class DynamicCoefficient:
         self.value = float(initial)
         self._calibrated = not calibrate
 
-    def update(self, values: np.ndarray | Sequence[float], reference: np.ndarray | Sequence[float]) -> float:
+    def update(
+        self, values: np.ndarray | Sequence[float], reference: np.ndarray | Sequence[float], provisional: bool = False
+    ) -> float:
         """
         Adjust the coefficient to one trajectory or batch, at most by one factor.
 
         :param values: what the coefficient scales, any shape
         :param reference: what the scaled values are compared with, any shape
+        :param provisional: the reference stands in for one that is still to come: the calibration is left for that one
         :return: the coefficient to use now
         """
         value, wanted = mean_magnitude(values), self.target_ratio * mean_magnitude(reference)
         if not (np.isfinite(value) and np.isfinite(wanted) and value > 0 and wanted > 0):
             return self.value
         if not self._calibrated:
-            self._calibrated = True
+            self._calibrated = not provisional
             self.value = wanted / value
         elif self.value * value < self.low * wanted:
             self.value *= self.factor
