@@ -272,7 +272,9 @@ class ChallengerCallback(BaseCallback):
         """Lines 4 to 19: rate every state of the new trajectories, choose, filter, cut and relabel."""
         assert self.challenger is not None
         self.proposals = []
-        for episode in self.buffer.pop_completed():
+        episodes = self.buffer.pop_completed()
+        self.buffer.remember_call(episodes)
+        for episode in episodes:
             if self.challenger.trained_updates == 0:
                 with self.stopwatch.section("bookkeeping"):
                     self.buffer.remember_reward(episode)  # what an untrained model says about novelty is noise

@@ -281,6 +281,19 @@ def test_row_mix_with_evaluation_progress_bar_and_tensorboard(tmp_path):
     assert any(path.name.startswith("events.out.tfevents") for path in tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("how", ["trajectory", "call"])
+def test_reward_memory_of_several_environments(how):
+    """Three episodes end in the same step: a call of the report's agent with three new trajectories."""
+    kwargs = dict(filter_kwargs=dict(reward_memory_update=how))
+    model = make_model(toy(n_envs=3), buffer_kwargs=kwargs, learning_starts=150, buffer_size=20_000)
+    model.learn(310, callback=make_callback())
+    buffer, memory = model.replay_buffer, None
+    ended = buffer.rewards[:100].reshape(2, 50, 3).mean(axis=1)  # two episodes of 50 steps in each environment
+    for means in [[mean] for mean in ended.ravel()] if how == "trajectory" else ended:
+        memory = np.mean(means) if memory is None else 0.99 * memory + 0.01 * np.mean(means)
+    assert buffer.coefficients["reward_memory"] == pytest.approx(memory, rel=1e-5)
+
+
 class RaisesAt(BaseCallback):
     def __init__(self, step, action):
         super().__init__()

@@ -545,7 +545,10 @@ def test_the_origin_is_saved_with_the_curator_and_curators_saved_before_load():
 
     former, _ = proposals(SIGNS["positive"], n=30)
     memory = former.filter.reward_memory
-    del former.origin, former.filter.self_balancing, former.reward.keep_mean, former.reward.zero_reward_size
+    del former.origin, former.filter.self_balancing, former.filter.reward_memory_update
+    del former.reward.keep_mean, former.reward.zero_reward_size, former.reward.distance_reference
+    for coefficient in (former.quality.c, former.quality.c1, former.reward.c_expl, former.reward.c_emb, former.reward.c_step):
+        del coefficient.statistic
     loaded = pickle.loads(pickle.dumps(former))
     loaded.propose(-rewards, evaluation)
     assert loaded.origin.value < 0.0 and loaded.filter.reward_memory == pytest.approx(0.99 * memory - 0.01 * rewards.mean())
@@ -567,6 +570,81 @@ def test_the_origin_is_saved_with_the_curator_and_curators_saved_before_load():
 def test_options_for_signs_are_checked(kwargs, message):
     with pytest.raises(ValueError, match=message):
         ChallengeCurator(**kwargs)
+
+
+# ---------------------------------------------------------------------- printed variants of the report
+
+
+def correlation_with_uncertainty(reference, seed):
+    """:return: Spearman's, of c_step and u over challenges whose u and r wander independently, u by a factor of hundreds"""
+    rng, u, r, rows = np.random.default_rng(seed), 0.0, 0.0, []
+    reward = ArtificialReward(distance_reference=reference)
+    for _ in range(500):
+        u, r = (0.95 * x + (1 - 0.95**2) ** 0.5 * rng.normal() for x in (u, r))
+        reward(
+            0.1 * np.exp(0.5 * r + rng.normal(0, 0.3, 30)),
+            np.exp(u + rng.normal(0, 0.3, 30)),
+            np.cumsum(rng.normal(1, 1, (31, 4)), axis=0),
+        )
+        rows.append((u, reward.c_step.value))
+    ranks = np.argsort(np.argsort(rows[20:], axis=0), axis=0)
+    return np.corrcoef(ranks.T)[0, 1]
+
+
+def test_with_u_as_the_reference_the_coefficient_of_steps_follows_u_as_in_figure_8():
+    printed = np.median([correlation_with_uncertainty("uncertainty", seed) for seed in range(8)])
+    ours = np.median([correlation_with_uncertainty("exploration", seed) for seed in range(8)])
+    assert printed == pytest.approx(0.87, abs=0.05) and ours == pytest.approx(0.39, abs=0.1)
+
+
+def test_distance_reference_by_hand():
+    reward = ArtificialReward(distance_reference="uncertainty")
+    a = reward(np.array([1.0, 2.0]), np.array([3.0, 3.0]), np.array([[0.0], [1.0], [4.0]]))
+    # c_expl as ever; d_emb = (1, 3), c_emb = 0.3 * 3 / 2; d_step = (0.5, 1), c_step = 0.3 * 3 / 0.75
+    np.testing.assert_allclose(a.exploration, [1.0, 1.0])
+    np.testing.assert_allclose(a.embedding, [0.45, 1.35])
+    np.testing.assert_allclose(a.step, [0.6, 1.2])
+
+
+def test_signed_means_give_back_and_forth_its_full_share():
+    embeddings = np.array([[0.0], [3.0], [2.0], [4.0]])  # d_emb = (3, -1, 2): mean 4/3, mean magnitude 2
+    for statistic, share in (("magnitude", 0.3 * (4 / 3) / 2), ("mean", 0.3)):
+        reward = ArtificialReward(coefficient_kwargs=dict(statistic=statistic))
+        a = reward(np.ones(3), np.ones(3), embeddings)
+        assert a.embedding.mean() / a.exploration.mean() == pytest.approx(share)
+
+
+def test_signed_means_of_opposite_signs_leave_a_coefficient_alone():
+    c = DynamicCoefficient(1.0, statistic="mean")
+    assert c.update([-1.0, -3.0], [4.0]) == 1.0 and c.update([2.0], [-4.0]) == 1.0 and c.update([1.0, -1.0], [4.0]) == 1.0
+    assert c.update([-1.0, -3.0], [-4.0, -4.0]) == pytest.approx(2.0)
+    with pytest.raises(ValueError, match="statistic must be one of .*'magnitude', 'mean'.*, got 'signed'"):
+        DynamicCoefficient(1.0, statistic="signed")
+
+
+def test_the_printed_novelty_is_ours_with_a_tolerance_of_one_half():
+    """w1 * c * r_bar <= c* * u_bar with w1 = 2, loosened by making w1 smaller."""
+    keep, printed = ChallengeFilter(novelty_tolerance=0.5), Tolerance(2.0, looser=-1)
+    rng = np.random.default_rng(0)
+    for scaled, u in rng.lognormal(size=(300, 2)):
+        verdict = printed.value * scaled <= 0.75 * u
+        assert keep.judge(statistics(scaled_reward=scaled, mean_uncertainty=u))[1]["novel"] == verdict
+        printed.update(verdict)
+        assert keep.w1.value == pytest.approx(1 / printed.value)
+
+
+def test_reward_memory_over_all_trajectories_of_a_call():
+    one_by_one, together = (ChallengeCurator(filter_kwargs=dict(reward_memory_update=how)) for how in ("trajectory", "call"))
+    first, second, third = np.full(10, 1.0), np.full(30, 2.0), np.full(20, 5.0)
+    for curator in (one_by_one, together):
+        for call in ([first, second], [], [third]):
+            curator.remember_call(call)
+            for rewards in call:
+                curator.propose(rewards, evaluation_of(len(rewards)))
+    assert one_by_one.filter.reward_memory == pytest.approx(0.99 * (0.99 * 1.0 + 0.01 * 2.0) + 0.01 * 5.0)
+    assert together.filter.reward_memory == pytest.approx(0.99 * 1.75 + 0.01 * 5.0)
+    with pytest.raises(ValueError, match="reward_memory_update must be one of .*, got 'rollout'"):
+        ChallengeFilter(reward_memory_update="rollout")
 
 
 # ---------------------------------------------------------------------- presets

@@ -348,6 +348,12 @@ class CPMBuffer(EpisodeBuffer):
         self._check_present(episode)
         self.curator.remember(self.rewards[episode.slots(self.buffer_size), episode.env_idx])
 
+    def remember_call(self, episodes: Sequence[Episode]) -> None:
+        """Before the episodes of a rollout are proposed from: the reward memory may count them together [B.5.2]."""
+        for episode in episodes:
+            self._check_present(episode)
+        self.curator.remember_call([self.rewards[e.slots(self.buffer_size), e.env_idx] for e in episodes])
+
     @property
     def challenges(self) -> list[Challenge]:
         """Challenges in I, oldest first."""

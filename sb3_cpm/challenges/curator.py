@@ -6,6 +6,7 @@ this needs (six coefficients, three tolerances, reward memory and origin) is her
 buffer.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -131,7 +132,7 @@ class ChallengeCurator:
                 uncertainty[kept],
                 embeddings[first : goal + 2],
                 origin=origin,
-                usual_reward=measured(self.coefficients["reward_memory"], origin),
+                usual_reward=abs(measured(self.filter.reward_memory or 0.0, origin)),
             )
         return Proposal(
             rewards=rewards,
@@ -154,8 +155,19 @@ class ChallengeCurator:
         :param rewards: task rewards of a complete trajectory, shape ``(n_steps,)``
         """
         rewards = np.asarray(rewards, dtype=np.float64)
-        self.filter.remember(float(rewards.mean()))
+        if self.filter.reward_memory_update == "trajectory":
+            self.filter.remember(float(rewards.mean()))
         self.origin.remember(rewards)
+
+    def remember_call(self, rewards: Sequence[np.ndarray]) -> None:
+        """
+        Before trajectories that came together are given to :meth:`propose` or :meth:`remember` in turn: let all of them count
+        for the reward memory once, with ``reward_memory_update="call"``.
+
+        :param rewards: task rewards of each, shape ``(n_steps,)``
+        """
+        if self.filter.reward_memory_update == "call" and rewards:
+            self.filter.remember(float(np.concatenate(rewards).mean(dtype=np.float64)))
 
     def refresh(self, proposal: Proposal, evaluation: Evaluation) -> Proposal:
         """
@@ -205,9 +217,16 @@ class ChallengeCurator:
         if "origin" not in state:  # saved before rewards had one: today's defaults, as for a run that begins now
             defaults = ChallengeCurator()
             self.origin = defaults.origin
-            for part in ("filter", "reward"):
-                ours, new = vars(getattr(self, part)), vars(getattr(defaults, part))
-                ours.update({name: value for name, value in new.items() if name not in ours})
+            reward, quality = self.reward, self.quality
+            for coefficient in (quality.c, quality.c1, reward.c_expl, reward.c_emb, reward.c_step):
+                _complete(coefficient, defaults.quality.c)
+            _complete(reward, defaults.reward)
+            _complete(self.filter, defaults.filter)
+
+
+def _complete(part: Any, default: Any) -> None:
+    """Give it the attributes that only the default has."""
+    vars(part).update({name: value for name, value in vars(default).items() if name not in vars(part)})
 
 
 def _checked(rewards: np.ndarray, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -92,6 +92,8 @@ class ChallengeFilter:
     :param gamma: strictness factor of all three tolerances
     :param target_acceptance: share of candidates that each of F1 to F3 accepts once settled
     :param reward_memory_decay: gamma_r of the mean reward memory, report: 0.99
+    :param reward_memory_update: ``"trajectory"``: r_new is the mean reward of each trajectory in turn; ``"call"``: of all that
+        came together (several environments), once for all of them, before any is judged (the report)
     :param self_balancing: ``"decisive"``: a tolerance moves where some value of it would have decided otherwise;
         ``"always"``: after every candidate (the report)
     :raises ValueError: for settings that cannot work
@@ -106,6 +108,7 @@ class ChallengeFilter:
         gamma: float = 1.05,
         target_acceptance: float = 0.5,
         reward_memory_decay: float = 0.99,
+        reward_memory_update: Literal["trajectory", "call"] = "trajectory",
         self_balancing: Literal["decisive", "always"] = "decisive",
     ):
         check_each(
@@ -118,6 +121,8 @@ class ChallengeFilter:
         check_each(SHARE, target_acceptance=target_acceptance, reward_memory_decay=reward_memory_decay)
         if reward_memory_decay == 1:
             raise ValueError(f"reward_memory_decay must lie in [0, 1), got {reward_memory_decay}")
+        check("reward_memory_update", reward_memory_update, choice("trajectory", "call"))
+        self.reward_memory_update = reward_memory_update
         check("self_balancing", self_balancing, choice("decisive", "always"))
         self.self_balancing = self_balancing
         self.reward_ratio = reward_ratio

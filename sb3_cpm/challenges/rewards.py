@@ -6,7 +6,7 @@ progress in steps, halved so that the sum is about as large as the task reward t
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -52,6 +52,9 @@ class ArtificialReward:
     :param embedding_ratio: target of mean(c_emb * d_emb) over mean(c_expl * u), report: 0.3
     :param step_ratio: target of mean(c_step * d_step) over mean(c_expl * u), report: 0.3
     :param scale: factor of the whole sum, report: 0.5
+    :param distance_reference: what the two terms of progress are compared with: ``"exploration"``, c_expl * u, whose size is
+        that of the task reward; ``"uncertainty"``, u itself, as printed in the report: c_emb and c_step then follow the
+        peaks of u (its Figure 8), and the size of r' does, too
     :param keep_mean: add that constant; False: r' as it is printed
     :param zero_reward_size: mean reward that the terms of a challenge without reward are sized for before there has been
         any. 0.1 is about that of ManiSkill's normalized dense rewards, and a tenth of a sparse reward of 1, which is not to be
@@ -66,6 +69,7 @@ class ArtificialReward:
         embedding_ratio: float = 0.3,
         step_ratio: float = 0.3,
         scale: float = 0.5,
+        distance_reference: Literal["exploration", "uncertainty"] = "exploration",
         keep_mean: bool = True,
         zero_reward_size: float | None = 0.1,
         coefficient_kwargs: dict[str, Any] | None = None,
@@ -73,11 +77,13 @@ class ArtificialReward:
         check_each(
             ABOVE_0, exploration_ratio=exploration_ratio, embedding_ratio=embedding_ratio, step_ratio=step_ratio, scale=scale
         )
+        check("distance_reference", distance_reference, choice("exploration", "uncertainty"))
         check("keep_mean", keep_mean, choice(True, False))
         optional = Rule(f"None or {ABOVE_0.words}", lambda value: value is None or ABOVE_0.holds(value))
         check("zero_reward_size", zero_reward_size, optional)
         kwargs = coefficient_kwargs or {}
         self.scale = scale
+        self.distance_reference = distance_reference
         self.keep_mean = keep_mean
         self.zero_reward_size = zero_reward_size
         self.c_expl = DynamicCoefficient(exploration_ratio, **kwargs)
@@ -101,17 +107,18 @@ class ArtificialReward:
         :param embeddings: e of every state from the challenge's start to its goal, shape ``(n + 1, embed_dim)``
         :param adapt: let the coefficients follow their targets
         :param origin: o, where rewards are measured from, see :class:`~sb3_cpm.challenges.origin.RewardOrigin`
-        :param usual_reward: the reward memory measured from there, 0 before any reward
+        :param usual_reward: size of the reward memory measured from there, 0 before any reward
         :return: artificial rewards and their terms
         """
         d_emb, d_step = embedding_progress(embeddings), step_progress(len(rewards))
         if adapt:
-            reference, provisional = self._reference(measured(rewards, origin), usual_reward)
-            self.c_expl.update(uncertainty, reference, provisional)
+            size, provisional = self._reference(measured(rewards, origin), usual_reward)
+            self.c_expl.update(uncertainty, size, provisional)
         exploration = self.c_expl.value * uncertainty
         if adapt:
-            self.c_emb.update(d_emb, exploration, provisional)
-            self.c_step.update(d_step, exploration, provisional)
+            reference = uncertainty if self.distance_reference == "uncertainty" else exploration
+            self.c_emb.update(d_emb, reference, provisional)
+            self.c_step.update(d_step, reference, provisional)
         embedding, step = self.c_emb.value * d_emb, self.c_step.value * d_step
         total = self.scale * (rewards + exploration + embedding + step)
         constant = 0.0
