@@ -35,6 +35,9 @@ from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
 from sb3_cpm.world_model.observations import unread
 
+#: Episodes in a row that are too short for a challenge before that is said.
+MANY_SHORT = 10
+
 
 class ChallengerCallback(BaseCallback):
     """
@@ -50,7 +53,8 @@ class ChallengerCallback(BaseCallback):
     ``rollout/exploration_rate``.
 
     :param preset: sizes and learning rates of the challenger, the name of one of :data:`sb3_cpm.presets.PRESETS` or a dict
-    :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds
+    :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds (with the
+        preset ``"report_images"``: all images)
     :param uncertainty_class: estimator of epistemic uncertainty, a name or a class
     :param uncertainty_kwargs: its arguments
     :param challenger_kwargs: entries of the preset to override
@@ -119,6 +123,8 @@ class ChallengerCallback(BaseCallback):
         self._previous_sigint: Any = None
         self._learn_started = 0.0
         self._next_training = 0
+        self._n_short = 0
+        self._told_of_short = False
 
     # ------------------------------------------------------------------ public
 
@@ -274,6 +280,7 @@ class ChallengerCallback(BaseCallback):
         self.proposals = []
         episodes = self.buffer.pop_completed()
         self.buffer.remember_call(episodes)
+        self._warn_of_short(episodes)
         for episode in episodes:
             if self.challenger.trained_updates == 0:
                 with self.stopwatch.section("bookkeeping"):
@@ -285,6 +292,21 @@ class ChallengerCallback(BaseCallback):
                 if proposal is not None:
                     self.proposals.append((episode, proposal))
                     self._log_proposal(proposal)
+
+    def _warn_of_short(self, episodes: Sequence[Episode]) -> None:
+        """Now and then one is no matter; where all are, there will never be a challenge, and nothing else would tell."""
+        first = self.buffer.curator.warmup_steps
+        for episode in episodes:  # F5: the first transition that counts is no goal
+            self._n_short = self._n_short + 1 if episode.length < first + 2 else 0
+            if self._n_short == MANY_SHORT and not self._told_of_short and self.buffer.challenge_ratio:
+                self._told_of_short = True
+                warnings.warn(
+                    f"{MANY_SHORT} episodes in a row had fewer than {first + 2} steps. They give no challenges: the first "
+                    f"warmup_steps={first} never count, and a goal comes after at least one that does. Give "
+                    "replay_buffer_kwargs a smaller warmup_steps (what C thinks of first steps is guesswork), or leave "
+                    "challenges out with challenge_ratio=0.",
+                    stacklevel=2,
+                )
 
     def _evaluate(self, episode: Episode) -> Evaluation:
         """What the challenger, as it is now, thinks of an episode that is still in D."""

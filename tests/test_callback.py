@@ -4,6 +4,7 @@ import gc
 import os
 import pickle
 import signal
+import warnings
 import weakref
 
 import gymnasium as gym
@@ -292,6 +293,20 @@ def test_reward_memory_of_several_environments(how):
     for means in [[mean] for mean in ended.ravel()] if how == "trajectory" else ended:
         memory = np.mean(means) if memory is None else 0.99 * memory + 0.01 * np.mean(means)
     assert buffer.coefficients["reward_memory"] == pytest.approx(memory, rel=1e-5)
+
+
+@pytest.mark.parametrize("length, warmup_steps, told", [(5, 5, 1), (6, 5, 1), (7, 5, 0), (5, 3, 0), (2, 1, 1)])
+def test_episodes_too_short_for_any_challenge_are_told_of_once(length, warmup_steps, told):
+    env = gym.make("sb3_cpm.envs.toy:CPMToy-v0", keys=("state",), max_episode_steps=length)
+    model = make_model(env, learning_starts=20, buffer_kwargs=dict(warmup_steps=warmup_steps))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        model.learn(180, callback=make_callback())
+    short = [str(warning.message) for warning in found if "episodes in a row" in str(warning.message)]
+    assert len(short) == told
+    if told:
+        assert f"fewer than {warmup_steps + 2} steps" in short[0] and f"warmup_steps={warmup_steps}" in short[0]
+        assert not model.replay_buffer.counters.kept
 
 
 class RaisesAt(BaseCallback):

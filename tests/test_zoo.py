@@ -108,6 +108,8 @@ def test_report_has_the_constants_of_the_report() -> None:
     constants = agent.hyperparameters
     assert constants["buffer_size"] == 50 * 50 and constants["gradient_steps"] == 6
     assert constants["replay_buffer_kwargs"] == {"challenge_ratio": 0.25, "mix": "batch", "max_challenges": 10}
+    assert constants["gamma"] == 0.99
+    assert constants["callback"]["sb3_cpm.ChallengerCallback"]["preset"] == "report_images"
     assert load_agent("cpm_sac_report", "CPM/TurnFaucet-v1").hyperparameters["buffer_size"] == 50 * 200
     assert load_agent("cpm_sac_report", "CPM/OpenCabinetDoor-v1").hyperparameters["buffer_size"] == 50 * 100
 
