@@ -61,6 +61,10 @@ class ChallengerCallback(BaseCallback):
     :param decay: decay model of the exploration probability epsilon, a name or a function of the remaining progress,
         see :func:`~sb3_cpm.exploration.make_decay`
     :param decay_kwargs: its start, floor and rate
+    :param decay_steps: number of environment steps (over all environments, as ``model.num_timesteps``) that the decay takes.
+        None: it runs from the beginning to the end of ``learn()``, as SB3's schedules do. Give it where training goes on in
+        portions, ``learn(..., reset_num_timesteps=False)`` again and again: else the first portion holds the whole decay, and
+        each further one repeats a piece of its end
     :param unit: whether P or C acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
     :param segment_length: number of steps in a segment
     :param train_freq: number of environment steps (over all environments) between the challenger's updates; those that fall
@@ -82,6 +86,7 @@ class ChallengerCallback(BaseCallback):
         challenger_kwargs: dict[str, Any] | None = None,
         decay: str | Schedule = "exponential",
         decay_kwargs: dict[str, Any] | None = None,
+        decay_steps: int | None = None,
         unit: ExplorationUnit = "step",
         segment_length: int = 10,
         train_freq: int = 25,
@@ -96,6 +101,8 @@ class ChallengerCallback(BaseCallback):
         check("unit", unit, choice("step", "segment", "episode"))
         check("segment_length", segment_length, integer(1))
         check_arguments("decay_kwargs", decay_kwargs, make_decay, excluded=("decay",))
+        if decay_steps is not None:
+            check("decay_steps", decay_steps, integer(1))
         if challenger_kwargs is not None:
             _check_challenger_kwargs(challenger_kwargs)
         choose_uncertainty(uncertainty_class, uncertainty_kwargs, make_preset(preset, **(challenger_kwargs or {})))
@@ -107,6 +114,7 @@ class ChallengerCallback(BaseCallback):
         if callable(decay) and decay_kwargs:
             raise ValueError(f"decay_kwargs {decay_kwargs} are for decays by name, but `decay` is a function, {decay!r}.")
         self.decay = make_decay(decay, **(decay_kwargs or {}))
+        self.decay_steps = decay_steps
         self.unit = unit
         self.segment_length = segment_length
         self.train_freq = train_freq
@@ -123,6 +131,7 @@ class ChallengerCallback(BaseCallback):
         self._previous_sigint: Any = None
         self._learn_started = 0.0
         self._next_training = 0
+        self._told_of_decay = False
         self._n_short = 0
         self._told_of_short = False
 
@@ -131,7 +140,9 @@ class ChallengerCallback(BaseCallback):
     @property
     def epsilon(self) -> float:
         """Probability that C, not P, acts now."""
-        return float(self.decay(self.model._current_progress_remaining))
+        if self.decay_steps is None:
+            return float(self.decay(self.model._current_progress_remaining))
+        return float(self.decay(max(1.0 - self.model.num_timesteps / self.decay_steps, 0.0)))
 
     @property
     def buffer(self) -> CPMBuffer:
@@ -195,6 +206,7 @@ class ChallengerCallback(BaseCallback):
         self._detach()
         if taken:
             raise ValueError("There are two ChallengerCallbacks in this learn(): a player has one challenger. Leave one out.")
+        self._warn_of_restarted_decay()
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
@@ -227,6 +239,21 @@ class ChallengerCallback(BaseCallback):
         # what came before learning_starts, and what an earlier learn() left, is no backlog
         self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
         self._listen_for_ctrl_c()
+
+    def _warn_of_restarted_decay(self) -> None:
+        """Training in portions: a decay over ``learn()`` is over after the first, and C hardly ever acts from then on."""
+        if self.decay_steps is not None or self.model._num_timesteps_at_start == 0 or self._told_of_decay:
+            return
+        before = self.epsilon  # until the first step the progress is that at the end of the last learn(), also after loading
+        at_start = float(self.decay(1.0 - self.model.num_timesteps / self.model._total_timesteps))
+        if at_start > before + 0.02:  # a little more of a long run is no new beginning
+            self._told_of_decay = True
+            warnings.warn(
+                f"The exploration probability had fallen to {before:.3g} and begins again at {at_start:.3g}: "
+                "its decay runs within each learn(). ChallengerCallback(decay_steps=...), the number of steps of all portions "
+                "together, makes it one decay.",
+                stacklevel=2,
+            )
 
     def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
         """Of a Dict that P and C share, each leaves out what the other may read; what neither does is lost."""

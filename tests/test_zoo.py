@@ -622,7 +622,8 @@ def test_a_continued_run_without_buffer_and_challenger_says_so(tmp_path: Path, c
     first = Path(manager.save_path)
     for name in ("replay_buffer.pkl", "challenger.pt"):
         (first / name).unlink()
-    model, (_, start) = train(tmp_path, 130, trained_agent=str(first / f"{TOY}.zip"))
+    with pytest.warns(UserWarning, match="begins again at .*decay_steps="):
+        model, (_, start) = train(tmp_path, 130, trained_agent=str(first / f"{TOY}.zip"))
     printed = capsys.readouterr().out
     assert "there is no challenger.pt" in printed and "there is no replay_buffer.pkl" in printed
     assert "train with --save-replay-buffer" in printed and "the 100 random steps of learning_starts" in printed
