@@ -35,6 +35,9 @@ from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
 from sb3_cpm.world_model.observations import unread
 
+#: Episodes in a row that are too short for a challenge before that is said.
+MANY_SHORT = 10
+
 
 class ChallengerCallback(BaseCallback):
     """
@@ -50,13 +53,18 @@ class ChallengerCallback(BaseCallback):
     ``rollout/exploration_rate``.
 
     :param preset: sizes and learning rates of the challenger, the name of one of :data:`sb3_cpm.presets.PRESETS` or a dict
-    :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds
+    :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds (with the
+        preset ``"report_images"``: all images)
     :param uncertainty_class: estimator of epistemic uncertainty, a name or a class
     :param uncertainty_kwargs: its arguments
     :param challenger_kwargs: entries of the preset to override
     :param decay: decay model of the exploration probability epsilon, a name or a function of the remaining progress,
         see :func:`~sb3_cpm.exploration.make_decay`
     :param decay_kwargs: its start, floor and rate
+    :param decay_steps: number of environment steps (over all environments, as ``model.num_timesteps``) that the decay takes.
+        None: it runs from the beginning to the end of ``learn()``, as SB3's schedules do. Give it where training goes on in
+        portions, ``learn(..., reset_num_timesteps=False)`` again and again: else the first portion holds the whole decay, and
+        each further one repeats a piece of its end
     :param unit: whether P or C acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
     :param segment_length: number of steps in a segment
     :param train_freq: number of environment steps (over all environments) between the challenger's updates; those that fall
@@ -78,6 +86,7 @@ class ChallengerCallback(BaseCallback):
         challenger_kwargs: dict[str, Any] | None = None,
         decay: str | Schedule = "exponential",
         decay_kwargs: dict[str, Any] | None = None,
+        decay_steps: int | None = None,
         unit: ExplorationUnit = "step",
         segment_length: int = 10,
         train_freq: int = 25,
@@ -92,6 +101,8 @@ class ChallengerCallback(BaseCallback):
         check("unit", unit, choice("step", "segment", "episode"))
         check("segment_length", segment_length, integer(1))
         check_arguments("decay_kwargs", decay_kwargs, make_decay, excluded=("decay",))
+        if decay_steps is not None:
+            check("decay_steps", decay_steps, integer(1))
         if challenger_kwargs is not None:
             _check_challenger_kwargs(challenger_kwargs)
         choose_uncertainty(uncertainty_class, uncertainty_kwargs, make_preset(preset, **(challenger_kwargs or {})))
@@ -103,6 +114,7 @@ class ChallengerCallback(BaseCallback):
         if callable(decay) and decay_kwargs:
             raise ValueError(f"decay_kwargs {decay_kwargs} are for decays by name, but `decay` is a function, {decay!r}.")
         self.decay = make_decay(decay, **(decay_kwargs or {}))
+        self.decay_steps = decay_steps
         self.unit = unit
         self.segment_length = segment_length
         self.train_freq = train_freq
@@ -119,13 +131,18 @@ class ChallengerCallback(BaseCallback):
         self._previous_sigint: Any = None
         self._learn_started = 0.0
         self._next_training = 0
+        self._told_of_decay = False
+        self._n_short = 0
+        self._told_of_short = False
 
     # ------------------------------------------------------------------ public
 
     @property
     def epsilon(self) -> float:
         """Probability that C, not P, acts now."""
-        return float(self.decay(self.model._current_progress_remaining))
+        if self.decay_steps is None:
+            return float(self.decay(self.model._current_progress_remaining))
+        return float(self.decay(max(1.0 - self.model.num_timesteps / self.decay_steps, 0.0)))
 
     @property
     def buffer(self) -> CPMBuffer:
@@ -189,6 +206,7 @@ class ChallengerCallback(BaseCallback):
         self._detach()
         if taken:
             raise ValueError("There are two ChallengerCallbacks in this learn(): a player has one challenger. Leave one out.")
+        self._warn_of_restarted_decay()
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
@@ -221,6 +239,21 @@ class ChallengerCallback(BaseCallback):
         # what came before learning_starts, and what an earlier learn() left, is no backlog
         self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
         self._listen_for_ctrl_c()
+
+    def _warn_of_restarted_decay(self) -> None:
+        """Training in portions: a decay over ``learn()`` is over after the first, and C hardly ever acts from then on."""
+        if self.decay_steps is not None or self.model._num_timesteps_at_start == 0 or self._told_of_decay:
+            return
+        before = self.epsilon  # until the first step the progress is that at the end of the last learn(), also after loading
+        at_start = float(self.decay(1.0 - self.model.num_timesteps / self.model._total_timesteps))
+        if at_start > before + 0.02:  # a little more of a long run is no new beginning
+            self._told_of_decay = True
+            warnings.warn(
+                f"The exploration probability had fallen to {before:.3g} and begins again at {at_start:.3g}: "
+                "its decay runs within each learn(). ChallengerCallback(decay_steps=...), the number of steps of all portions "
+                "together, makes it one decay.",
+                stacklevel=2,
+            )
 
     def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
         """Of a Dict that P and C share, each leaves out what the other may read; what neither does is lost."""
@@ -272,7 +305,10 @@ class ChallengerCallback(BaseCallback):
         """Lines 4 to 19: rate every state of the new trajectories, choose, filter, cut and relabel."""
         assert self.challenger is not None
         self.proposals = []
-        for episode in self.buffer.pop_completed():
+        episodes = self.buffer.pop_completed()
+        self.buffer.remember_call(episodes)
+        self._warn_of_short(episodes)
+        for episode in episodes:
             if self.challenger.trained_updates == 0:
                 with self.stopwatch.section("bookkeeping"):
                     self.buffer.remember_reward(episode)  # what an untrained model says about novelty is noise
@@ -283,6 +319,21 @@ class ChallengerCallback(BaseCallback):
                 if proposal is not None:
                     self.proposals.append((episode, proposal))
                     self._log_proposal(proposal)
+
+    def _warn_of_short(self, episodes: Sequence[Episode]) -> None:
+        """Now and then one is no matter; where all are, there will never be a challenge, and nothing else would tell."""
+        first = self.buffer.curator.warmup_steps
+        for episode in episodes:  # F5: the first transition that counts is no goal
+            self._n_short = self._n_short + 1 if episode.length < first + 2 else 0
+            if self._n_short == MANY_SHORT and not self._told_of_short and self.buffer.challenge_ratio:
+                self._told_of_short = True
+                warnings.warn(
+                    f"{MANY_SHORT} episodes in a row had fewer than {first + 2} steps. They give no challenges: the first "
+                    f"warmup_steps={first} never count, and a goal comes after at least one that does. Give "
+                    "replay_buffer_kwargs a smaller warmup_steps (what C thinks of first steps is guesswork), or leave "
+                    "challenges out with challenge_ratio=0.",
+                    stacklevel=2,
+                )
 
     def _evaluate(self, episode: Episode) -> Evaluation:
         """What the challenger, as it is now, thinks of an episode that is still in D."""
@@ -341,6 +392,7 @@ class ChallengerCallback(BaseCallback):
         if proposal.artificial is not None:
             self.logger.record_mean("challenge/length", len(proposal.artificial.total))
             self.logger.record_mean("challenge/reward", proposal.artificial.total.mean())
+            self.logger.record_mean("challenge/reward_constant", proposal.artificial.constant)
             for term in REWARD_TERMS:
                 self.logger.record_mean(f"challenge/reward_{term}", getattr(proposal.artificial, term).mean())
 

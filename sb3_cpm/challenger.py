@@ -45,8 +45,8 @@ class Challenger:
     :param observation_space: Dict space; images (3-D, with finite bounds) and vectors (1-D) are read
     :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
     :param device: "auto" takes the GPU where there is one
-    :param preset: "default", "report", or a dict of entries, see :mod:`sb3_cpm.presets`
-    :param keys: the observation keys to read; all images and vectors by default
+    :param preset: "default", "report", "report_images", or a dict of entries, see :mod:`sb3_cpm.presets`
+    :param keys: the observation keys to read; all images, and vectors unless the preset leaves them out, by default
     :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
         :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
     :param uncertainty_kwargs: arguments for it, on top of the preset's
@@ -70,7 +70,9 @@ class Challenger:
         check_action_space(action_space)
         self.observation_space, self.action_space = observation_space, action_space
         self.action_dim = int(np.prod(action_space.shape))
-        self.spec = ObservationSpec(observation_space, keys, squash=self.preset["symlog_vectors"])
+        self.spec = ObservationSpec(
+            observation_space, keys, squash=self.preset["symlog_vectors"], vectors=self.preset["read_vectors"]
+        )
         self.keys: tuple[str, ...] = self.spec.keys
         self.batch_size: int = self.preset["batch_size"]
         self.sequence_length: int = self.preset["sequence_length"]

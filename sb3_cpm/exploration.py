@@ -2,7 +2,8 @@
 Challenge exploration: how often the challenger acts, and the wrapper through which it does (report, section 4.2).
 
 The report's own decay models are lost (its appendix B.4 is empty); the usual ones are offered here. All follow SB3's
-schedule convention: a function of the remaining progress, which falls from 1 to 0 over ``learn()``.
+schedule convention: a function of the remaining progress, which falls from 1 to 0 over ``learn()``, or over the
+callback's ``decay_steps``.
 """
 
 import math

@@ -2,10 +2,14 @@
 Sizes and constants of the challenger as plain data (report, section 4.1 and B.1; docs/method.md),
 and of what is made of its challenges (4.3 and B.6).
 
-``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. ``"default"`` is
-small enough for two CPU cores: an update takes about 0.1 CPU seconds for vectors and 0.15 for two 32x32 cameras. ``"report"``
-takes 4 to 6 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
-``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that
+``"report"`` has the report's sizes where it names them, and DreamerV2's for continuous control elsewhere. It also reads
+vectors, such as the robot's state, and has a continue head; the report has neither. ``"report_images"`` is the report's own
+world model: images only, and two heads, for images and reward. Both leave out the actor-critic for the task, which the report
+trains beside that for exploration (``train_task_behavior=True``), and by which C never acts. The number of ensemble heads is
+not in the report; 10 is ours. ``"default"`` is small enough for two CPU cores: an update takes about 0.1 CPU seconds for
+vectors and 0.15 for two 32x32 cameras. ``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate
+800 x 15 imagined steps: without a GPU add ``imagination_starts=256``, which needs a third of that. A preset of your own is a
+dict with the entries that
 differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
 """
 
@@ -23,6 +27,7 @@ REPORT: dict[str, Any] = {
     # encoder and decoder
     "cnn_depth": 32,  # channels of the first convolution
     "cnn_layers": 4,  # convolutions, each halves the image; 32x32 becomes 2x2 and an embedding of 32 * cnn_depth
+    "read_vectors": True,  # whether vectors are read beside images, where `keys` does not say what is read
     "vector_layers": 2,  # hidden layers of the MLPs that encode and decode vectors
     "vector_units": 400,  # size of each of them
     "symlog_vectors": True,  # squash vectors with symlog: robust to whatever range the environment uses
@@ -110,7 +115,10 @@ DEFAULT: dict[str, Any] = {
     },
 }
 
-PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT}
+#: The report's own world model, of images alone and without a continue head [B.1].
+REPORT_IMAGES: dict[str, Any] = {**REPORT, "read_vectors": False, "continue_head": False}
+
+PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT, "report_images": REPORT_IMAGES}
 
 #: Arguments of :class:`~sb3_cpm.buffers.CPMBuffer`: how challenges are used. "report" has its constants, which are the
 #: buffer's defaults, too. "tuned" makes less of challenges: on a dense reward those of the report slow the player down

@@ -4,6 +4,7 @@ import gc
 import os
 import pickle
 import signal
+import warnings
 import weakref
 
 import gymnasium as gym
@@ -114,7 +115,7 @@ def test_going_on_without_the_buffer(tmp_path):
     with pytest.raises(ValueError, match="Set learning_starts=200 or more, or go on with the buffer"):
         resumed.learn(100, callback=make_callback(), reset_num_timesteps=False)
     resumed.learning_starts = 200
-    resumed.learn(100, callback=make_callback(), reset_num_timesteps=False)
+    resumed.learn(100, callback=make_callback(decay_steps=250), reset_num_timesteps=False)
 
 
 def test_a_buffer_without_challenges_is_mentioned():
@@ -218,9 +219,9 @@ def test_save_load_continue(tmp_path):
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert loaded.replay_buffer.coefficients == coefficients
     assert len(loaded.replay_buffer.challenges) == len(model.replay_buffer.challenges)
-    resumed = make_callback(load_path=tmp_path / "challenger.pt")
+    resumed = make_callback(load_path=tmp_path / "challenger.pt", decay_steps=600)
     loaded.learn(200, callback=resumed, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 600
+    assert loaded.num_timesteps == 600 and resumed.epsilon == pytest.approx(0.05 + 0.75 * np.exp(-5.0))
     assert resumed.challenger.trained_updates > callback.challenger.trained_updates
     assert loaded.replay_buffer.counters.proposed > proposed
 
@@ -276,9 +277,89 @@ def test_row_mix_with_evaluation_progress_bar_and_tensorboard(tmp_path):
     logger.close()
     header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
     names = {"rollout/exploration_rate", "challenger/world_model_loss", "challenger/exp_scale"}
-    names |= {f"challenge/{name}" for name in ("kept", "c_emb", "w3", "reward_memory", "acceptance_novel")}
+    names |= {f"challenge/{name}" for name in ("kept", "c_emb", "w3", "reward_memory", "reward_origin", "acceptance_novel")}
     assert names <= set(header)
     assert any(path.name.startswith("events.out.tfevents") for path in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("how", ["trajectory", "call"])
+def test_reward_memory_of_several_environments(how):
+    """Three episodes end in the same step: a call of the report's agent with three new trajectories."""
+    kwargs = dict(filter_kwargs=dict(reward_memory_update=how))
+    model = make_model(toy(n_envs=3), buffer_kwargs=kwargs, learning_starts=150, buffer_size=20_000)
+    model.learn(310, callback=make_callback())
+    buffer, memory = model.replay_buffer, None
+    ended = buffer.rewards[:100].reshape(2, 50, 3).mean(axis=1)  # two episodes of 50 steps in each environment
+    for means in [[mean] for mean in ended.ravel()] if how == "trajectory" else ended:
+        memory = np.mean(means) if memory is None else 0.99 * memory + 0.01 * np.mean(means)
+    assert buffer.coefficients["reward_memory"] == pytest.approx(memory, rel=1e-5)
+
+
+@pytest.mark.parametrize("length, warmup_steps, told", [(5, 5, 1), (6, 5, 1), (7, 5, 0), (5, 3, 0), (2, 1, 1)])
+def test_episodes_too_short_for_any_challenge_are_told_of_once(length, warmup_steps, told):
+    env = gym.make("sb3_cpm.envs.toy:CPMToy-v0", keys=("state",), max_episode_steps=length)
+    model = make_model(env, learning_starts=20, buffer_kwargs=dict(warmup_steps=warmup_steps))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        model.learn(180, callback=make_callback())
+    short = [str(warning.message) for warning in found if "episodes in a row" in str(warning.message)]
+    assert len(short) == told
+    if told:
+        assert f"fewer than {warmup_steps + 2} steps" in short[0] and f"warmup_steps={warmup_steps}" in short[0]
+        assert not model.replay_buffer.counters.kept
+
+
+def learn_in_portions(portions, **kwargs):
+    """:return: share of the actions that C gave in 600 steps, and epsilon after each portion"""
+    model = make_model(learning_starts=100, train_freq=10)
+    callback = make_callback(**kwargs, gradient_steps=0)
+    shares, epsilons = [], []
+    for _ in range(portions):
+        model.learn(600 // portions, callback=callback, reset_num_timesteps=False)
+        shares.append(callback.explored_share)
+        epsilons.append(callback.epsilon)
+    return np.mean(shares), epsilons
+
+
+def test_a_decay_over_a_number_of_steps_runs_through_all_portions():
+    decay = dict(decay="linear", decay_kwargs=dict(start=0.9, floor=0.1), decay_steps=600)
+    at_once, _ = learn_in_portions(1, **decay)
+    in_portions, epsilons = learn_in_portions(6, **decay)
+    assert at_once == pytest.approx(0.5, abs=0.06) and in_portions == pytest.approx(0.5, abs=0.06)
+    assert epsilons == pytest.approx([0.9 - 0.8 * n / 6 for n in range(1, 7)])
+    _, epsilons = learn_in_portions(2, **{**decay, "decay_steps": 400})
+    assert epsilons == pytest.approx([0.3, 0.1]), "after its end it stays at the floor"
+
+
+def test_a_decay_that_begins_again_in_every_portion_is_told_of_once():
+    with pytest.warns(UserWarning, match="had fallen to 0.1 and begins again at 0.5: .*decay_steps=") as found:
+        share, _ = learn_in_portions(6, decay="linear", decay_kwargs=dict(start=0.9, floor=0.1))
+    assert len(found) == 1 and share < 0.35, "C gives what the decay has for the end most of the time"
+    learn_in_portions(3, decay="constant")  # has no end to begin again from
+
+
+def test_a_decay_that_begins_again_after_loading_is_told_of_too(tmp_path):
+    model = make_model(train_freq=10)
+    model.learn(150, callback=make_callback(gradient_steps=0))
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = SAC.load(tmp_path / "model", toy())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    with pytest.warns(UserWarning, match="had fallen to 0.0551 and begins again at 0.112"):
+        loaded.learn(150, callback=make_callback(gradient_steps=0), reset_num_timesteps=False)
+
+
+def test_starting_anew_begins_the_decay_anew_without_a_word():
+    model, callback = make_model(train_freq=10), make_callback(decay="linear", decay_kwargs={}, gradient_steps=0)
+    for _ in range(2):
+        model.learn(150, callback=callback)
+    assert callback.epsilon == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("value, message", [(0, "an integer of at least 1, got 0"), (1e5, "Write 100000"), ("1e5", "text")])
+def test_decay_steps_are_checked(value, message):
+    with pytest.raises(ValueError, match=f"decay_steps must be .*{message}"):
+        ChallengerCallback(decay_steps=value)
 
 
 class RaisesAt(BaseCallback):

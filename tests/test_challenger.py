@@ -388,6 +388,18 @@ def test_the_report_preset_has_the_reports_sizes() -> None:
     assert (challenger.batch_size, challenger.sequence_length) == (16, 50)
 
 
+def test_the_reports_own_world_model_reads_images_only_and_has_two_heads() -> None:
+    challenger = Challenger(BOTH, box(7), device="cpu", preset="report_images")
+    model = challenger.world_model
+    assert challenger.spec.image_keys == challenger.keys and challenger.keys
+    assert model.continue_head is None and model.encoder.mlp is None and model.decoder.mlp is None
+    assert Challenger(BOTH, box(7), device="cpu", preset="report").spec.vector_keys
+    named = Challenger(BOTH, box(7), device="cpu", preset=SMALL, keys=list(BOTH), read_vectors=False)
+    assert set(named.keys) == set(BOTH), "keys that are named are read"
+    with pytest.raises(ValueError, match="No observation key is an image .* read_vectors=False leaves vectors out"):
+        Challenger(VECTOR, box(2), device="cpu", preset="report_images")
+
+
 # ---- leaving out what is not needed, starting from another one -------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_cpm import CPMBuffer
-from sb3_cpm.challenges import ChallengeCurator, ChallengeFilter, ChallengeQuality, DynamicCoefficient
+from sb3_cpm.challenges import ChallengeCurator, ChallengeFilter, ChallengeQuality, DynamicCoefficient, RewardOrigin
 from sb3_cpm.challenges.filters import CandidateStatistics, Tolerance
 from sb3_cpm.challenges.quality import best_goal
 from sb3_cpm.challenges.rewards import ArtificialReward, embedding_progress, step_progress
@@ -324,6 +324,327 @@ def test_a_broken_evaluation_is_refused_and_changes_nothing(broken):
     with pytest.raises(ValueError, match="20-step trajectory"):
         curator.propose(rewards, evaluation)
     assert pickle.dumps(curator) == before
+
+
+# ---------------------------------------------------------------------- rewards that are not positive
+
+
+def trajectory(rng, n_steps=50):
+    """Positive rewards and an evaluation, both larger in some trajectories than in others."""
+    rewards = rng.gamma(4.0, 0.1, n_steps) * rng.lognormal(0.0, 0.3)
+    disagreement = rng.gamma(4.0, 0.01, n_steps) * rng.lognormal(0.0, 0.3)
+    embeddings = np.linspace(0, 30, n_steps + 1)[:, None] + rng.normal(0.0, 0.3, (n_steps + 1, 4))
+    return rewards, Evaluation(disagreement, rng.gamma(4.0, 2.0, n_steps), embeddings)
+
+
+def proposals(change, n=300, seed=0, **kwargs):
+    """
+    :param change: makes a trajectory's rewards of (positive rewards, number of the trajectory)
+    :return: the curator, and what it said of n trajectories
+    """
+    rng, curator, result = np.random.default_rng(seed), ChallengeCurator(**kwargs), []
+    for number in range(n):
+        rewards, evaluation = trajectory(rng)
+        result.append(curator.propose(change(rewards, number), evaluation))
+    return curator, result
+
+
+def mountain_car(rewards, number):
+    """Actions cost up to 0.1; from the 50th trajectory on every fourth one reaches the goal at its end."""
+    costs = -0.1 * np.minimum(rewards, 1.0)
+    costs[-1] += 100.0 * (number >= 50 and number % 4 == 0)
+    return costs
+
+
+SIGNS = {
+    "positive": lambda r, number: r,
+    "shifted": lambda r, number: r - 1.0,
+    "shifted far": lambda r, number: r - 1000.0,
+    "shifted to a mean of zero": lambda r, number: r - 0.418,
+    "mirrored": lambda r, number: -r,
+    "mirrored and large": lambda r, number: -50.0 * r,
+    "of both signs in turn": lambda r, number: r if number % 2 else -r,
+    "action costs and rare success": mountain_car,
+    "rising from below zero": lambda r, number: r - 8.0 * np.exp(-number / 60),
+}
+
+
+@pytest.mark.parametrize("kind", SIGNS)
+def test_novelty_settles_at_its_target_acceptance_whatever_the_sign(kind):
+    _, found = proposals(SIGNS[kind])
+    w1 = [p.coefficients["w1"] for p in found]
+    assert min(w1) > 1e-2 and max(w1) < 1e2
+    assert np.mean([p.verdicts["novel"] for p in found[100:]]) == pytest.approx(0.5, abs=0.1)
+    # most of what is kept passes two of three criteria, each of which accepts half
+    assert np.mean([p.accepted for p in found[100:]]) == pytest.approx(0.5, abs=0.15)
+
+
+@pytest.mark.parametrize("kind", SIGNS)
+def test_artificial_rewards_stay_in_the_range_of_the_task_whatever_the_sign(kind):
+    _, found = proposals(SIGNS[kind])
+    kept = [p.artificial for p in found[100:] if p.accepted]
+    mean, of_task = (np.mean([getattr(a, name).mean() for a in kept]) for name in ("total", "extrinsic"))
+    assert mean == pytest.approx(1.03 * of_task, abs=0.15 * abs(1.03 * of_task) + 1e-12)
+
+
+def test_after_negative_rewards_positive_ones_are_judged_at_once():
+    """The printed F1 holds for all negative rewards; w1, tightened by 300 of them, then held all else back for hundreds."""
+    _, found = proposals(lambda r, number: r - 3.0 if number < 300 else r, n=450)
+    assert np.mean([p.verdicts["novel"] for p in found[350:]]) == pytest.approx(0.5, abs=0.12)
+    _, found = proposals(lambda r, number: r - 3.0 if number < 300 else r, n=450, **FORMER)
+    assert not any(p.verdicts["novel"] for p in found[300:])
+
+
+FORMER = dict(
+    reward_origin="zero",
+    filter_kwargs=dict(self_balancing="always"),
+    reward_kwargs=dict(keep_mean=False, zero_reward_size=None),
+)
+
+
+def test_the_former_form_is_an_option_and_equal_for_positive_rewards():
+    ours, found = proposals(SIGNS["positive"])
+    printed, found_by_printed = proposals(SIGNS["positive"], **FORMER)
+    for p, q in zip(found, found_by_printed, strict=True):
+        assert p.coefficients == q.coefficients and p.verdicts == q.verdicts and p.goal == q.goal
+        np.testing.assert_array_equal(p.score, q.score)
+        if p.accepted:
+            np.testing.assert_array_equal(p.artificial.total, q.artificial.total)
+            assert p.artificial.constant == 0.0
+    assert ours.origin.value == printed.origin.value == 0.0
+
+    _, found = proposals(SIGNS["mirrored"], **FORMER)
+    assert all(p.verdicts["novel"] for p in found) and found[-1].coefficients["w1"] < 1e-2
+    cancelled = np.mean([p.artificial.total.mean() / p.artificial.extrinsic.mean() for p in found if p.accepted])
+    assert abs(cancelled) < 0.1
+
+
+@given(shift=st.floats(-1e4, 0.0), further=st.floats(-1e4, -1.0), seed=st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_a_constant_added_to_negative_rewards_decides_nothing(shift, further, seed):
+    _, found = proposals(lambda r, number: shift - r, n=40, seed=seed)
+    _, moved = proposals(lambda r, number: shift + further - r, n=40, seed=seed)
+    for p, q in zip(found, moved, strict=True):
+        assert p.verdicts == q.verdicts and p.goal == q.goal
+        np.testing.assert_allclose(p.score, q.score, rtol=1e-6, atol=1e-6)
+        assert q.coefficients["reward_origin"] - p.coefficients["reward_origin"] == pytest.approx(further)
+        for name in ("c", "c1", "c_expl", "c_emb", "c_step", "w1", "w2", "w3"):
+            assert p.coefficients[name] == pytest.approx(q.coefficients[name], rel=1e-6)
+        if p.accepted:
+            np.testing.assert_allclose(p.artificial.total + further, q.artificial.total, rtol=1e-6, atol=1e-6)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=30), st.integers(0, 100))
+@settings(max_examples=50, deadline=None)
+def test_any_challenge_with_a_negative_reward_keeps_the_mean_of_the_task(rewards, seed):
+    rewards, reward = np.array([*rewards, -1.0]), ArtificialReward()
+    rng = np.random.default_rng(seed)
+    a = reward(rewards, rng.random(len(rewards)), rng.random((len(rewards) + 1, 3)))
+    assert a.total.mean() == pytest.approx(rewards.mean(), abs=1e-6)
+    terms = reward.scale * (a.extrinsic + a.exploration + a.embedding + a.step)
+    np.testing.assert_allclose(a.total, terms + a.constant, atol=1e-9)
+
+
+def test_origin_by_hand():
+    origin = RewardOrigin()
+    assert origin.value == 0.0
+    origin.remember(np.arange(11.0))  # its lower decile is 1
+    assert origin.value == 0.0, "positive rewards are measured from zero"
+    origin.remember(np.array([0.0] * 10 + [-110.0]))  # lower decile 0, mean -10
+    assert origin.value == pytest.approx(-10.0 + 0.1 * 11.0)  # between the levels -10 and 1
+    for _ in range(RewardOrigin.WINDOW):
+        origin.remember(np.array([-1.0, -3.0]))
+    assert origin.value == pytest.approx(-2.8)
+    zero = RewardOrigin("zero")
+    zero.remember(np.array([-5.0]))
+    assert zero.value == 0.0
+
+
+def test_negative_rewards_by_hand():
+    """r = (-4, -2) from o = -6 is (2, 4), with a mean of 3."""
+    reward = ArtificialReward()
+    a = reward(np.array([-4.0, -2.0]), np.array([1.0, 3.0]), np.array([[0.0], [1.0], [4.0]]), origin=-6.0)
+    # c_expl = 3 / 1.5 / 2 = 1; d_emb = (1, 3), c_emb = 0.3 * 2 / 2; d_step = (0.5, 1), c_step = 0.3 * 2 / 0.75
+    np.testing.assert_allclose(a.exploration, [1.0, 3.0])
+    np.testing.assert_allclose(a.embedding, [0.3, 0.9])
+    np.testing.assert_allclose(a.step, [0.4, 0.8])
+    # 0.5 * (-4 + 1.7) = -1.15 and 0.5 * (-2 + 4.7) = 1.35 have the mean 0.1, the task -3
+    assert a.constant == pytest.approx(-3.1)
+    np.testing.assert_allclose(a.total, [-4.25, -1.75])
+
+
+@pytest.mark.parametrize("reward", [-1.0, -0.1, -1e-3, -1000.0])
+def test_a_constant_reward_moves_nothing_that_it_does_not_decide(reward):
+    """A mean of -0.1 throughout is not quite -0.1: rounding is no reward that c could be measured by."""
+    curator, found = proposals(lambda r, number: np.full_like(r, reward), n=100)
+    assert curator.filter.w1.value == 2.0 and curator.filter.w2.value == 8.0
+    assert curator.quality.c.value == 1.0
+    assert all(p.verdicts["novel"] and p.verdicts["relevant"] for p in found)
+    for p in found:
+        if p.accepted:
+            assert p.artificial.total.mean() == pytest.approx(reward)
+            assert p.artificial.exploration.mean() == pytest.approx(0.1 / 1.5)
+
+
+def test_a_sparse_reward_below_zero_is_judged_as_one_above():
+    """Fetch's -1 until success is 0 until success, shifted."""
+
+    def sparse(number):
+        return np.arange(50) >= (40 if number % 5 == 0 else 50)
+
+    _, above = proposals(lambda r, number: sparse(number).astype(float))
+    _, below = proposals(lambda r, number: sparse(number) - 1.0)
+    assert [p.verdicts for p in above] == [p.verdicts for p in below]
+    w1, w2 = ([p.coefficients[name] for p in below] for name in ("w1", "w2"))
+    assert min(*w1, *w2) > 1e-2 and max(*w1, *w2) < 1e2
+
+
+def test_challenges_without_any_reward_have_a_size_of_their_own():
+    """Before it was that of u: c_expl was 1 because it begins at 1."""
+    _, found = proposals(lambda r, number: np.zeros_like(r))
+    kept = [p.artificial.total.mean() for p in found if p.accepted]
+    assert kept[0] == pytest.approx(0.5 * 0.1 / 1.5 * 1.6)
+    assert np.median(kept) == pytest.approx(0.5 * 0.1 / 1.5 * 1.6, rel=0.15)
+    _, found = proposals(lambda r, number: np.zeros_like(r), reward_kwargs=dict(zero_reward_size=2.0))
+    assert np.median([p.artificial.total.mean() for p in found if p.accepted]) == pytest.approx(0.5 * 2 / 1.5 * 1.6, rel=0.15)
+
+
+def test_the_first_reward_still_calibrates_and_then_the_memory_stands_in():
+    reward = ArtificialReward()
+    u, embeddings = np.full(10, 4.0), np.linspace(0, 1, 11)[:, None]
+    assert reward(np.zeros(10), u, embeddings).exploration.mean() == pytest.approx(0.1 / 1.5)
+    a = reward(np.full(10, 30.0), u, embeddings)
+    assert a.exploration.mean() == pytest.approx(20.0)
+    assert a.embedding.mean() == pytest.approx(6.0) and a.step.mean() == pytest.approx(6.0)
+    for _ in range(60):
+        a = reward(np.zeros(10), u, embeddings, usual_reward=3.0)
+    assert 0.75 <= a.exploration.mean() / 2.0 <= 4 / 3
+    assert a.constant == 0.0
+
+
+def test_without_calibration_a_stand_in_moves_by_one_factor_too():
+    reward = ArtificialReward(coefficient_kwargs=dict(calibrate=False))
+    a = reward(np.zeros(10), np.ones(10), np.linspace(0, 1, 11)[:, None])
+    assert a.exploration.mean() == pytest.approx(1 / 1.15)
+
+
+def test_refreshed_rewards_keep_the_mean_too():
+    curator, found = proposals(SIGNS["mirrored"], n=60)
+    p = next(p for p in reversed(found) if p.accepted)
+    refreshed = curator.refresh(p, trajectory(np.random.default_rng(9))[1])
+    assert refreshed.artificial.total.mean() == pytest.approx(refreshed.artificial.extrinsic.mean())
+
+
+def test_the_origin_is_saved_with_the_curator_and_curators_saved_before_load():
+    curator, _ = proposals(SIGNS["mirrored"], n=30)
+    loaded = pickle.loads(pickle.dumps(curator))
+    assert loaded.origin.value == curator.origin.value < 0.0
+    rewards, evaluation = trajectory(np.random.default_rng(5))
+    p, q = curator.propose(-rewards, evaluation), loaded.propose(-rewards, evaluation)
+    assert p.coefficients == q.coefficients and p.verdicts == q.verdicts
+
+    former, _ = proposals(SIGNS["positive"], n=30)
+    memory = former.filter.reward_memory
+    del former.origin, former.filter.self_balancing, former.filter.reward_memory_update
+    del former.reward.keep_mean, former.reward.zero_reward_size, former.reward.distance_reference
+    for coefficient in (former.quality.c, former.quality.c1, former.reward.c_expl, former.reward.c_emb, former.reward.c_step):
+        del coefficient.statistic
+    loaded = pickle.loads(pickle.dumps(former))
+    loaded.propose(-rewards, evaluation)
+    assert loaded.origin.value < 0.0 and loaded.filter.reward_memory == pytest.approx(0.99 * memory - 0.01 * rewards.mean())
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(reward_origin="mean"), "reward_origin must be one of .*'low_quantile', 'zero'.*, got 'mean'"),
+        (dict(filter_kwargs=dict(self_balancing="never")), "filter_kwargs: self_balancing must be one of .*got 'never'"),
+        (dict(reward_kwargs=dict(keep_mean="yes")), "reward_kwargs: keep_mean must be one of .*got 'yes'"),
+        (
+            dict(reward_kwargs=dict(zero_reward_size=0)),
+            "zero_reward_size must be None or a finite number above 0",
+        ),
+        (dict(reward_kwargs=dict(zero_reward_size="1e-2")), "That is text"),
+    ],
+)
+def test_options_for_signs_are_checked(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ChallengeCurator(**kwargs)
+
+
+# ---------------------------------------------------------------------- printed variants of the report
+
+
+def correlation_with_uncertainty(reference, seed):
+    """:return: Spearman's, of c_step and u over challenges whose u and r wander independently, u by a factor of hundreds"""
+    rng, u, r, rows = np.random.default_rng(seed), 0.0, 0.0, []
+    reward = ArtificialReward(distance_reference=reference)
+    for _ in range(500):
+        u, r = (0.95 * x + (1 - 0.95**2) ** 0.5 * rng.normal() for x in (u, r))
+        reward(
+            0.1 * np.exp(0.5 * r + rng.normal(0, 0.3, 30)),
+            np.exp(u + rng.normal(0, 0.3, 30)),
+            np.cumsum(rng.normal(1, 1, (31, 4)), axis=0),
+        )
+        rows.append((u, reward.c_step.value))
+    ranks = np.argsort(np.argsort(rows[20:], axis=0), axis=0)
+    return np.corrcoef(ranks.T)[0, 1]
+
+
+def test_with_u_as_the_reference_the_coefficient_of_steps_follows_u_as_in_figure_8():
+    printed = np.median([correlation_with_uncertainty("uncertainty", seed) for seed in range(8)])
+    ours = np.median([correlation_with_uncertainty("exploration", seed) for seed in range(8)])
+    assert printed == pytest.approx(0.87, abs=0.05) and ours == pytest.approx(0.39, abs=0.1)
+
+
+def test_distance_reference_by_hand():
+    reward = ArtificialReward(distance_reference="uncertainty")
+    a = reward(np.array([1.0, 2.0]), np.array([3.0, 3.0]), np.array([[0.0], [1.0], [4.0]]))
+    # c_expl as ever; d_emb = (1, 3), c_emb = 0.3 * 3 / 2; d_step = (0.5, 1), c_step = 0.3 * 3 / 0.75
+    np.testing.assert_allclose(a.exploration, [1.0, 1.0])
+    np.testing.assert_allclose(a.embedding, [0.45, 1.35])
+    np.testing.assert_allclose(a.step, [0.6, 1.2])
+
+
+def test_signed_means_give_back_and_forth_its_full_share():
+    embeddings = np.array([[0.0], [3.0], [2.0], [4.0]])  # d_emb = (3, -1, 2): mean 4/3, mean magnitude 2
+    for statistic, share in (("magnitude", 0.3 * (4 / 3) / 2), ("mean", 0.3)):
+        reward = ArtificialReward(coefficient_kwargs=dict(statistic=statistic))
+        a = reward(np.ones(3), np.ones(3), embeddings)
+        assert a.embedding.mean() / a.exploration.mean() == pytest.approx(share)
+
+
+def test_signed_means_of_opposite_signs_leave_a_coefficient_alone():
+    c = DynamicCoefficient(1.0, statistic="mean")
+    assert c.update([-1.0, -3.0], [4.0]) == 1.0 and c.update([2.0], [-4.0]) == 1.0 and c.update([1.0, -1.0], [4.0]) == 1.0
+    assert c.update([-1.0, -3.0], [-4.0, -4.0]) == pytest.approx(2.0)
+    with pytest.raises(ValueError, match="statistic must be one of .*'magnitude', 'mean'.*, got 'signed'"):
+        DynamicCoefficient(1.0, statistic="signed")
+
+
+def test_the_printed_novelty_is_ours_with_a_tolerance_of_one_half():
+    """w1 * c * r_bar <= c* * u_bar with w1 = 2, loosened by making w1 smaller."""
+    keep, printed = ChallengeFilter(novelty_tolerance=0.5), Tolerance(2.0, looser=-1)
+    rng = np.random.default_rng(0)
+    for scaled, u in rng.lognormal(size=(300, 2)):
+        verdict = printed.value * scaled <= 0.75 * u
+        assert keep.judge(statistics(scaled_reward=scaled, mean_uncertainty=u))[1]["novel"] == verdict
+        printed.update(verdict)
+        assert keep.w1.value == pytest.approx(1 / printed.value)
+
+
+def test_reward_memory_over_all_trajectories_of_a_call():
+    one_by_one, together = (ChallengeCurator(filter_kwargs=dict(reward_memory_update=how)) for how in ("trajectory", "call"))
+    first, second, third = np.full(10, 1.0), np.full(30, 2.0), np.full(20, 5.0)
+    for curator in (one_by_one, together):
+        for call in ([first, second], [], [third]):
+            curator.remember_call(call)
+            for rewards in call:
+                curator.propose(rewards, evaluation_of(len(rewards)))
+    assert one_by_one.filter.reward_memory == pytest.approx(0.99 * (0.99 * 1.0 + 0.01 * 2.0) + 0.01 * 5.0)
+    assert together.filter.reward_memory == pytest.approx(0.99 * 1.75 + 0.01 * 5.0)
+    with pytest.raises(ValueError, match="reward_memory_update must be one of .*, got 'rollout'"):
+        ChallengeFilter(reward_memory_update="rollout")
 
 
 # ---------------------------------------------------------------------- presets

@@ -245,7 +245,7 @@ def test_masked_rows_keep_the_state() -> None:
 
 
 def test_presets_have_the_same_entries_and_are_copied() -> None:
-    assert set(PRESETS["report"]) == set(PRESETS["default"])
+    assert set(PRESETS["report"]) == set(PRESETS["default"]) == set(PRESETS["report_images"])
     make_preset("report")["gamma"] = 0.0
     assert PRESETS["report"]["gamma"] == 0.99
     assert (PRESETS["report"]["deter_size"], PRESETS["report"]["stoch_size"], PRESETS["report"]["horizon"]) == (200, 50, 15)

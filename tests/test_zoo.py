@@ -108,6 +108,8 @@ def test_report_has_the_constants_of_the_report() -> None:
     constants = agent.hyperparameters
     assert constants["buffer_size"] == 50 * 50 and constants["gradient_steps"] == 6
     assert constants["replay_buffer_kwargs"] == {"challenge_ratio": 0.25, "mix": "batch", "max_challenges": 10}
+    assert constants["gamma"] == 0.99
+    assert constants["callback"]["sb3_cpm.ChallengerCallback"]["preset"] == "report_images"
     assert load_agent("cpm_sac_report", "CPM/TurnFaucet-v1").hyperparameters["buffer_size"] == 50 * 200
     assert load_agent("cpm_sac_report", "CPM/OpenCabinetDoor-v1").hyperparameters["buffer_size"] == 50 * 100
 
@@ -620,7 +622,8 @@ def test_a_continued_run_without_buffer_and_challenger_says_so(tmp_path: Path, c
     first = Path(manager.save_path)
     for name in ("replay_buffer.pkl", "challenger.pt"):
         (first / name).unlink()
-    model, (_, start) = train(tmp_path, 130, trained_agent=str(first / f"{TOY}.zip"))
+    with pytest.warns(UserWarning, match="begins again at .*decay_steps="):
+        model, (_, start) = train(tmp_path, 130, trained_agent=str(first / f"{TOY}.zip"))
     printed = capsys.readouterr().out
     assert "there is no challenger.pt" in printed and "there is no replay_buffer.pkl" in printed
     assert "train with --save-replay-buffer" in printed and "the 100 random steps of learning_starts" in printed
@@ -721,6 +724,7 @@ class TestGoingOn:
         run_tiny(tmp_path, 10, trained_agent=str(stopped / f"{TOY}.zip"), tensorboard_log=str(tmp_path / "tb"))
         assert [path.parent.name for path in tmp_path.glob("tb/*/*/events*")] == ["SAC_3"]
 
+    @pytest.mark.filterwarnings("ignore:The exploration probability had fallen:UserWarning")
     def test_learning_starts_does_not_pile_up(self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         agent, config = stopped / f"{TOY}.zip", tiny(tmp_path, learning_starts=None)
         for n_steps in (60, 120):

@@ -24,7 +24,7 @@ from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
 from sb3_cpm.buffers.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
 from sb3_cpm.buffers.sequences import side_by_side
 from sb3_cpm.buffers.storage import Episode
-from sb3_cpm.challenges import ChallengeCurator, Proposal
+from sb3_cpm.challenges import ChallengeCurator, OriginKind, Proposal
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 
@@ -64,6 +64,8 @@ class CPMBuffer(EpisodeBuffer):
     :param filter_kwargs: see :class:`~sb3_cpm.challenges.filters.ChallengeFilter` [B.5.2]
     :param reward_kwargs: see :class:`~sb3_cpm.challenges.rewards.ArtificialReward` [B.6]
     :param coefficient_kwargs: see :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient` [B.7]
+    :param reward_origin: where rewards are measured from: ``"low_quantile"``, a moving low quantile of them where that is
+        negative, else zero; ``"zero"``, as the report has it. See :class:`~sb3_cpm.challenges.origin.RewardOrigin`
     :param refresh_every: re-evaluate challenges whose rewards are at least this many transitions old with today's world
         model (beyond the report). None: rewards stay those of the moment when the challenge was kept [4.3]
     :param demonstration_ratio: share of P's updates or of each batch, as ``mix`` says, from :meth:`add_demonstrations`, and of
@@ -100,6 +102,7 @@ class CPMBuffer(EpisodeBuffer):
         filter_kwargs: dict[str, Any] | None = None,
         reward_kwargs: dict[str, Any] | None = None,
         coefficient_kwargs: dict[str, Any] | None = None,
+        reward_origin: OriginKind = "low_quantile",
         refresh_every: int | None = None,
         demonstration_ratio: float = 0.1,
         storage_dtypes: dict[str, StorageSpec] | None = None,
@@ -132,7 +135,7 @@ class CPMBuffer(EpisodeBuffer):
         self.terminal_goals = terminal_goals
         self.refresh_every = refresh_every
         self.curator = ChallengeCurator(
-            warmup_steps, kl_ratio, reward_ratio, filter_kwargs, reward_kwargs, coefficient_kwargs=coefficient_kwargs
+            warmup_steps, kl_ratio, reward_ratio, filter_kwargs, reward_kwargs, coefficient_kwargs, reward_origin
         )
         #: Demonstrations, as a buffer of their own; None while there are none.
         self.demonstrations: EpisodeBuffer | None = None
@@ -157,7 +160,7 @@ class CPMBuffer(EpisodeBuffer):
         self.counters = ChallengeCounters()
 
     def reset(self) -> None:
-        """Forget all transitions, episodes and challenges. Demonstrations, coefficients, tolerances and reward memory stay."""
+        """Forget all transitions, episodes and challenges. Demonstrations and what the curator has learnt of rewards stay."""
         super().reset()
         self._forget_challenges()
 
@@ -341,9 +344,15 @@ class CPMBuffer(EpisodeBuffer):
         return self._imaginary.pop_sampled_age()
 
     def remember_reward(self, episode: Episode) -> None:
-        """Let an episode count for the mean reward memory without proposing a challenge (while C knows nothing yet)."""
+        """Let an episode count for reward memory and origin without proposing a challenge (while C knows nothing yet)."""
         self._check_present(episode)
-        self.curator.filter.remember(float(self.rewards[episode.slots(self.buffer_size), episode.env_idx].mean()))
+        self.curator.remember(self.rewards[episode.slots(self.buffer_size), episode.env_idx])
+
+    def remember_call(self, episodes: Sequence[Episode]) -> None:
+        """Before the episodes of a rollout are proposed from: the reward memory may count them together [B.5.2]."""
+        for episode in episodes:
+            self._check_present(episode)
+        self.curator.remember_call([self.rewards[e.slots(self.buffer_size), e.env_idx] for e in episodes])
 
     @property
     def challenges(self) -> list[Challenge]:
@@ -352,7 +361,7 @@ class CPMBuffer(EpisodeBuffer):
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients, tolerances and reward memory by the report's names."""
+        """Coefficients, tolerances, reward memory and origin by name."""
         return self.curator.coefficients
 
     # ------------------------------------------------------------------ demonstrations

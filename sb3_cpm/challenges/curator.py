@@ -2,9 +2,11 @@
 The challenge curator: from a finished trajectory and the challenger's evaluation of it to a challenge, or none.
 
 Lines 9 to 18 of Algorithm 1 in the report: score every transition, choose the goal, filter, relabel. All state that
-this needs (six coefficients, three tolerances, the reward memory) is here, in plain numbers, and is pickled with the buffer.
+this needs (six coefficients, three tolerances, reward memory and origin) is here, in plain numbers, and is pickled with the
+buffer.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 
 from sb3_cpm.arguments import ABOVE_0, check, check_arguments, check_each, integer, told_where
 from sb3_cpm.challenges.filters import CandidateStatistics, ChallengeFilter
+from sb3_cpm.challenges.origin import OriginKind, RewardOrigin, measured
 from sb3_cpm.challenges.quality import ChallengeQuality, best_goal
 from sb3_cpm.challenges.rewards import ArtificialReward, ArtificialRewards
 from sb3_cpm.challenges.targeting import DynamicCoefficient
@@ -60,6 +63,7 @@ class ChallengeCurator:
     :param filter_kwargs: passed to :class:`~sb3_cpm.challenges.filters.ChallengeFilter`
     :param reward_kwargs: passed to :class:`~sb3_cpm.challenges.rewards.ArtificialReward`
     :param coefficient_kwargs: passed to every :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
+    :param reward_origin: see :class:`~sb3_cpm.challenges.origin.RewardOrigin`
     :raises ValueError: for arguments that cannot work, naming the nearest where one is misspelt
     """
 
@@ -71,6 +75,7 @@ class ChallengeCurator:
         filter_kwargs: dict[str, Any] | None = None,
         reward_kwargs: dict[str, Any] | None = None,
         coefficient_kwargs: dict[str, Any] | None = None,
+        reward_origin: OriginKind = "low_quantile",
     ):
         check("warmup_steps", warmup_steps, integer(0))
         check_each(ABOVE_0, kl_ratio=kl_ratio, reward_ratio=reward_ratio)
@@ -78,6 +83,7 @@ class ChallengeCurator:
         check_arguments("reward_kwargs", reward_kwargs, ArtificialReward, excluded=("coefficient_kwargs",))
         check_arguments("coefficient_kwargs", coefficient_kwargs, DynamicCoefficient, excluded=("target_ratio",))
         self.warmup_steps = warmup_steps
+        self.origin = RewardOrigin(reward_origin)
         with told_where("coefficient_kwargs"):
             self.quality = ChallengeQuality(kl_ratio, reward_ratio, coefficient_kwargs)
         with told_where("filter_kwargs"):
@@ -96,14 +102,16 @@ class ChallengeCurator:
         first = self.warmup_steps
         if len(rewards) == 0:
             return None
-        self.filter.remember(float(rewards.mean()))
+        self.remember(rewards)
         if len(rewards) <= first:
             return None
 
         uncertainty = self.quality.uncertainty(disagreement, kl, first)
-        score = self.quality.score(rewards, uncertainty, first)
+        origin = self.origin.value
+        from_origin = measured(rewards, origin)
+        score = self.quality.score(from_origin, uncertainty, first)
         goal = best_goal(score, first)
-        mean_reward = float(rewards[first:].mean())
+        mean_reward = float(from_origin[first:].mean())
         accepted, verdicts = self.filter.judge(
             CandidateStatistics(
                 mean_reward=mean_reward,
@@ -113,12 +121,19 @@ class ChallengeCurator:
                 goal_score=float(score[goal]),
                 goal=goal,
                 first=first,
+                origin=origin,
             )
         )
         artificial = None
         if accepted:
             kept = slice(first, goal + 1)
-            artificial = self.reward(rewards[kept], uncertainty[kept], embeddings[first : goal + 2])
+            artificial = self.reward(
+                rewards[kept],
+                uncertainty[kept],
+                embeddings[first : goal + 2],
+                origin=origin,
+                usual_reward=abs(measured(self.filter.reward_memory or 0.0, origin)),
+            )
         return Proposal(
             rewards=rewards,
             uncertainty=uncertainty,
@@ -133,10 +148,31 @@ class ChallengeCurator:
             artificial=artificial,
         )
 
+    def remember(self, rewards: np.ndarray) -> None:
+        """
+        Let a trajectory count for reward memory and origin.
+
+        :param rewards: task rewards of a complete trajectory, shape ``(n_steps,)``
+        """
+        rewards = np.asarray(rewards, dtype=np.float64)
+        if self.filter.reward_memory_update == "trajectory":
+            self.filter.remember(float(rewards.mean()))
+        self.origin.remember(rewards)
+
+    def remember_call(self, rewards: Sequence[np.ndarray]) -> None:
+        """
+        Before trajectories that came together are given to :meth:`propose` or :meth:`remember` in turn: let all of them count
+        for the reward memory once, with ``reward_memory_update="call"``.
+
+        :param rewards: task rewards of each, shape ``(n_steps,)``
+        """
+        if self.filter.reward_memory_update == "call" and rewards:
+            self.filter.remember(float(np.concatenate(rewards).mean(dtype=np.float64)))
+
     def refresh(self, proposal: Proposal, evaluation: Evaluation) -> Proposal:
         """
         The rewards of a challenge that was kept, with a newer evaluation of its trajectory. Where it starts and ends stays,
-        and so do coefficients, tolerances and reward memory: nothing new has happened.
+        and so do coefficients, tolerances, reward memory and origin: nothing new has happened.
 
         :param proposal: an accepted one
         :param evaluation: of the whole trajectory
@@ -145,16 +181,17 @@ class ChallengeCurator:
         """
         rewards, disagreement, kl, embeddings = _checked(proposal.rewards, evaluation)
         uncertainty = self.quality.c1.value * kl + disagreement
+        origin = self.origin.value
         kept = slice(proposal.first, proposal.goal + 1)
         return replace(
             proposal,
             uncertainty=uncertainty,
-            score=self.quality.c.value * rewards + uncertainty,
+            score=self.quality.c.value * measured(rewards, origin) + uncertainty,
             disagreement=disagreement,
             kl=kl,
             coefficients=self.coefficients,
             artificial=self.reward(
-                rewards[kept], uncertainty[kept], embeddings[proposal.first : proposal.goal + 2], adapt=False
+                rewards[kept], uncertainty[kept], embeddings[proposal.first : proposal.goal + 2], adapt=False, origin=origin
             ),
         )
 
@@ -172,7 +209,24 @@ class ChallengeCurator:
             "w2": self.filter.w2.value,
             "w3": self.filter.w3.value,
             "reward_memory": float("nan") if memory is None else memory,
+            "reward_origin": self.origin.value,
         }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if "origin" not in state:  # saved before rewards had one: today's defaults, as for a run that begins now
+            defaults = ChallengeCurator()
+            self.origin = defaults.origin
+            reward, quality = self.reward, self.quality
+            for coefficient in (quality.c, quality.c1, reward.c_expl, reward.c_emb, reward.c_step):
+                _complete(coefficient, defaults.quality.c)
+            _complete(reward, defaults.reward)
+            _complete(self.filter, defaults.filter)
+
+
+def _complete(part: Any, default: Any) -> None:
+    """Give it the attributes that only the default has."""
+    vars(part).update({name: value for name, value in vars(default).items() if name not in vars(part)})
 
 
 def _checked(rewards: np.ndarray, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

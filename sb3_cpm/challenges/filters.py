@@ -4,11 +4,14 @@ Challenge filter with self-balancing strictness: is a candidate worth keeping?
 Report, section 4.4.2 and appendix B.5.2. Five criteria; at least two of the first three and both of the last must hold.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from sb3_cpm.arguments import ABOVE_0, SHARE, check_each
+from sb3_cpm.arguments import ABOVE_0, SHARE, check, check_each, choice
+from sb3_cpm.challenges.origin import measured
 
 #: The criteria in the report's order, F1 to F5.
 CRITERIA = ("novel", "relevant", "highlight", "sane", "not_first")
@@ -47,15 +50,17 @@ class Tolerance:
 @dataclass(frozen=True)
 class CandidateStatistics:
     """
-    What the criteria look at. Means are over the counted transitions of the whole trajectory.
+    What the criteria look at. Means are over the counted transitions of the whole trajectory, rewards measured from the
+    origin.
 
-    :param mean_reward: r_bar
-    :param scaled_reward: c * r_bar
+    :param mean_reward: r_bar - o
+    :param scaled_reward: c * (r_bar - o)
     :param mean_uncertainty: u_bar
     :param mean_score: S_bar
     :param goal_score: S_g
     :param goal: index g of the goal transition
     :param first: index of the first counted transition
+    :param origin: o, see :class:`~sb3_cpm.challenges.origin.RewardOrigin`
     """
 
     mean_reward: float
@@ -65,6 +70,7 @@ class CandidateStatistics:
     goal_score: float
     goal: int
     first: int
+    origin: float = 0.0
 
 
 class ChallengeFilter:
@@ -73,7 +79,11 @@ class ChallengeFilter:
 
     F1 follows the report's sentence ("negligible refers to falling short of r_bar by a tolerance factor"), not its
     printed formula, which has the tolerance on the other side and would be stricter the larger w1 is. F2 and F3 are
-    written so that they mean the same for negative rewards and scores: tolerance is then measured by the magnitude.
+    written so that they mean the same for negative values: tolerance is then measured by the magnitude.
+
+    A tolerance moves only where it has a say. Rewards of zero, for example, are novel enough whatever w1 is: let them move it,
+    and it would run to the end of its range and hold nothing back, or everything, for hundreds of candidates once there are
+    rewards.
 
     :param reward_ratio: c*, the target ratio of the challenge quality, report: 0.75
     :param novelty_tolerance: w1 at the start, report: 2.0
@@ -82,6 +92,10 @@ class ChallengeFilter:
     :param gamma: strictness factor of all three tolerances
     :param target_acceptance: share of candidates that each of F1 to F3 accepts once settled
     :param reward_memory_decay: gamma_r of the mean reward memory, report: 0.99
+    :param reward_memory_update: ``"trajectory"``: r_new is the mean reward of each trajectory in turn; ``"call"``: of all that
+        came together (several environments), once for all of them, before any is judged (the report)
+    :param self_balancing: ``"decisive"``: a tolerance moves where some value of it would have decided otherwise;
+        ``"always"``: after every candidate (the report)
     :raises ValueError: for settings that cannot work
     """
 
@@ -94,6 +108,8 @@ class ChallengeFilter:
         gamma: float = 1.05,
         target_acceptance: float = 0.5,
         reward_memory_decay: float = 0.99,
+        reward_memory_update: Literal["trajectory", "call"] = "trajectory",
+        self_balancing: Literal["decisive", "always"] = "decisive",
     ):
         check_each(
             ABOVE_0,
@@ -105,6 +121,10 @@ class ChallengeFilter:
         check_each(SHARE, target_acceptance=target_acceptance, reward_memory_decay=reward_memory_decay)
         if reward_memory_decay == 1:
             raise ValueError(f"reward_memory_decay must lie in [0, 1), got {reward_memory_decay}")
+        check("reward_memory_update", reward_memory_update, choice("trajectory", "call"))
+        self.reward_memory_update = reward_memory_update
+        check("self_balancing", self_balancing, choice("decisive", "always"))
+        self.self_balancing = self_balancing
         self.reward_ratio = reward_ratio
         self.w1 = Tolerance(novelty_tolerance, looser=+1, gamma=gamma, target_acceptance=target_acceptance)
         self.w2 = Tolerance(relevance_tolerance, looser=+1, gamma=gamma, target_acceptance=target_acceptance)
@@ -128,18 +148,27 @@ class ChallengeFilter:
         :param candidate: statistics of the trajectory and its goal
         :return: for each of :data:`CRITERIA`, whether it would keep the candidate
         """
-        memory = candidate.mean_reward if self.reward_memory is None else self.reward_memory
-        w1, w2, w3 = self.w1.value, self.w2.value, self.w3.value
         return {
-            # c * r_bar <= w1 * c* * u_bar
-            "novel": candidate.scaled_reward <= w1 * self.reward_ratio * candidate.mean_uncertainty,
-            # w2 * r_bar >= r_mem for a positive memory: r_bar may fall below it by the share 1 - 1/w2 of its magnitude
-            "relevant": candidate.mean_reward >= memory - (1 - 1 / w2) * abs(memory),
-            # S_g >= w3 * S_bar for a positive mean score
-            "highlight": candidate.goal_score - candidate.mean_score >= (w3 - 1) * abs(candidate.mean_score),
+            **{name: bool(holds(tolerance.value)) for name, tolerance, holds in self._tolerant(candidate)},
             "sane": candidate.goal_score > 0,
             "not_first": candidate.goal > candidate.first,
         }
+
+    def _tolerant(self, candidate: CandidateStatistics) -> list[tuple[str, Tolerance, Callable[[float], bool]]]:
+        """:return: F1 to F3, each with its tolerance and as a function of that"""
+        memory = candidate.mean_reward if self.reward_memory is None else measured(self.reward_memory, candidate.origin)
+
+        def novel(w1: float) -> bool:  # c * r_bar <= w1 * c* * u_bar
+            return candidate.scaled_reward <= w1 * self.reward_ratio * candidate.mean_uncertainty
+
+        def relevant(w2: float) -> bool:
+            # w2 * r_bar >= r_mem for a positive memory: r_bar may fall below it by the share 1 - 1/w2 of its magnitude
+            return candidate.mean_reward >= memory - (1 - 1 / w2) * abs(memory)
+
+        def highlight(w3: float) -> bool:  # S_g >= w3 * S_bar for a positive mean score
+            return candidate.goal_score - candidate.mean_score >= (w3 - 1) * abs(candidate.mean_score)
+
+        return [("novel", self.w1, novel), ("relevant", self.w2, relevant), ("highlight", self.w3, highlight)]
 
     def judge(self, candidate: CandidateStatistics) -> tuple[bool, dict[str, bool]]:
         """
@@ -148,9 +177,9 @@ class ChallengeFilter:
         :param candidate: statistics of the trajectory and its goal
         :return: whether it is kept, and the verdict of each criterion
         """
-        verdicts = {name: bool(verdict) for name, verdict in self.verdicts(candidate).items()}
+        verdicts = self.verdicts(candidate)
         majority = verdicts["novel"] + verdicts["relevant"] + verdicts["highlight"] >= 2
-        self.w1.update(verdicts["novel"])
-        self.w2.update(verdicts["relevant"])
-        self.w3.update(verdicts["highlight"])
+        for name, tolerance, holds in self._tolerant(candidate):
+            if self.self_balancing == "always" or holds(Tolerance.MIN) != holds(Tolerance.MAX):
+                tolerance.update(verdicts[name])
         return majority and verdicts["sane"] and verdicts["not_first"], verdicts

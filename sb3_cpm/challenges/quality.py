@@ -35,7 +35,7 @@ class ChallengeQuality:
 
     def score(self, rewards: np.ndarray, uncertainty: np.ndarray, first: int) -> np.ndarray:
         """
-        :param rewards: task reward of every transition, shape ``(n_steps,)``
+        :param rewards: task reward of every transition, measured from the origin, shape ``(n_steps,)``
         :param uncertainty: u of every transition, shape ``(n_steps,)``
         :param first: index of the first counted transition; earlier ones don't move c
         :return: S, shape ``(n_steps,)``

@@ -6,10 +6,11 @@ orders during training; a fixed coefficient between them would be wrong most of 
 """
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
-from sb3_cpm.arguments import ABOVE_0, check_each
+from sb3_cpm.arguments import ABOVE_0, check, check_each, choice
 
 #: Coefficients stay within these bounds whatever the statistics do.
 MIN_COEFFICIENT, MAX_COEFFICIENT = 1e-8, 1e8
@@ -34,6 +35,8 @@ class DynamicCoefficient:
         step from one side of the interval can land on the other and the coefficient oscillates for ever.
     :param initial: the coefficient before the first call
     :param calibrate: set the coefficient to the exact target at the first usable call
+    :param statistic: ``"magnitude"``: means of absolute values; ``"mean"``: means as the report prints them [B.6]. Means of
+        opposite signs then leave the coefficient as it is
     :raises ValueError: for settings that cannot settle
     """
 
@@ -45,6 +48,7 @@ class DynamicCoefficient:
         factor: float = 1.15,
         initial: float = 1.0,
         calibrate: bool = True,
+        statistic: Literal["magnitude", "mean"] = "magnitude",
     ):
         check_each(ABOVE_0, target_ratio=target_ratio, low=low, high=high, factor=factor, initial=initial)
         if not factor > 1:
@@ -59,26 +63,33 @@ class DynamicCoefficient:
             )
         if not MIN_COEFFICIENT <= initial <= MAX_COEFFICIENT:
             raise ValueError(f"initial must lie in [{MIN_COEFFICIENT}, {MAX_COEFFICIENT}], got {initial}")
+        check("statistic", statistic, choice("magnitude", "mean"))
         self.target_ratio = target_ratio
+        self.statistic = statistic
         self.low = low
         self.high = high
         self.factor = factor
         self.value = float(initial)
         self._calibrated = not calibrate
 
-    def update(self, values: np.ndarray | Sequence[float], reference: np.ndarray | Sequence[float]) -> float:
+    def update(
+        self, values: np.ndarray | Sequence[float], reference: np.ndarray | Sequence[float], provisional: bool = False
+    ) -> float:
         """
         Adjust the coefficient to one trajectory or batch, at most by one factor.
 
         :param values: what the coefficient scales, any shape
         :param reference: what the scaled values are compared with, any shape
+        :param provisional: the reference stands in for one that is still to come: the calibration is left for that one
         :return: the coefficient to use now
         """
-        value, wanted = mean_magnitude(values), self.target_ratio * mean_magnitude(reference)
+        value, wanted = self._mean(values), self.target_ratio * self._mean(reference)
+        if value < 0 and wanted < 0:
+            value, wanted = -value, -wanted
         if not (np.isfinite(value) and np.isfinite(wanted) and value > 0 and wanted > 0):
             return self.value
         if not self._calibrated:
-            self._calibrated = True
+            self._calibrated = not provisional
             self.value = wanted / value
         elif self.value * value < self.low * wanted:
             self.value *= self.factor
@@ -87,8 +98,9 @@ class DynamicCoefficient:
         self.value = float(np.clip(self.value, MIN_COEFFICIENT, MAX_COEFFICIENT))
         return self.value
 
-
-def mean_magnitude(values: np.ndarray | Sequence[float]) -> float:
-    """Mean of the absolute values (rewards can be negative); nan for no values."""
-    values = np.asarray(values, dtype=np.float64)
-    return float(np.abs(values).mean()) if values.size else float("nan")
+    def _mean(self, values: np.ndarray | Sequence[float]) -> float:
+        """:return: the statistic; nan for no values"""
+        values = np.asarray(values, dtype=np.float64)
+        if not values.size:
+            return float("nan")
+        return float(values.mean() if self.statistic == "mean" else np.abs(values).mean())

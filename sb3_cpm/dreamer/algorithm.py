@@ -408,7 +408,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             saved, wanted = data["policy_kwargs"], _changed(data["policy_kwargs"], given)
             preset = wanted["preset"]
             changes = {name: value for name, value in wanted.items() if name != "preset" and value != saved[name]}
-            changes |= {name: value for name, value in preset.items() if value != saved["preset"][name]}
+            before = make_preset(saved["preset"])  # of an earlier version it may lack entries
+            changes |= {name: value for name, value in preset.items() if value != before[name]}
             objects["policy_kwargs"] = wanted
             kwargs = {"batch_size": preset["batch_size"], "gamma": preset["gamma"], **kwargs}
             if "model_lr" in changes:

@@ -168,7 +168,7 @@ def _draw_curves(axes: Axes, proposal: Proposal) -> None:
     n_steps = len(proposal.rewards)
     arrival = np.arange(1, n_steps + 1)  # transition t is about arriving in state t + 1
     first, goal = proposal.first, proposal.goal
-    scaled_rewards = proposal.coefficients["c"] * proposal.rewards
+    scaled_rewards = proposal.score - proposal.uncertainty  # c r, r measured from its origin
     axes.axvspan(first, goal + 1, color=GREEN if proposal.accepted else RED, alpha=0.10, lw=0)
     axes.axvspan(0, first, facecolor="none", edgecolor="#cbd5e0", hatch="///", lw=0)
     axes.plot(arrival, scaled_rewards, color=BLUE)

@@ -202,13 +202,13 @@ def _proposal_row(episode: Episode, proposal: Proposal) -> dict[str, Any]:
         "mean_kl": float(proposal.kl[counted].mean()),
         "mean_score": float(proposal.score[counted].mean()),
         "goal_score": float(proposal.score[proposal.goal]),
-        **{f"artificial_{name}": _mean_of(artificial, name) for name in ("total", *REWARD_TERMS)},
+        **{f"artificial_{name}": _mean_of(artificial, name) for name in ("total", *REWARD_TERMS, "constant")},
         **{name: float(value) for name, value in proposal.coefficients.items()},
     }
 
 
 def _mean_of(artificial: Any, name: str) -> float | None:
-    return None if artificial is None else float(getattr(artificial, name).mean())
+    return None if artificial is None else float(np.mean(getattr(artificial, name)))
 
 
 def _channels_last(frames: np.ndarray, space: spaces.Space) -> np.ndarray:

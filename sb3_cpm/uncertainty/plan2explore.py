@@ -23,7 +23,7 @@ class Plan2Explore(ScaledUncertainty):
     In imagination it computes exactly what it computes on real transitions: a disagreement needs no outcome.
 
     :param sizes: sizes of latents and actions
-    :param heads: K, 10 in the report
+    :param heads: K; the report gives no number
     :param layers: hidden layers of each head
     :param units: size of each of them
     :param target: what the heads predict of state t+1: "feat" (the whole latent, the report's choice), "stoch", "deter" or

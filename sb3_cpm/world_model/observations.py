@@ -61,17 +61,20 @@ class ObservationSpec:
     :param observation_space: Dict space as SB3's VecEnv gives it
     :param keys: the keys to read; all images and vectors by default
     :param squash: squash vectors with ``symlog``
+    :param vectors: whether vectors are among those that are read by default
     :raises ValueError: for a space that is not a Dict, unknown or unusable keys, images of unequal size
     """
 
-    def __init__(self, observation_space: spaces.Dict, keys: Sequence[str] | None = None, squash: bool = True) -> None:
+    def __init__(
+        self, observation_space: spaces.Dict, keys: Sequence[str] | None = None, squash: bool = True, vectors: bool = True
+    ) -> None:
         if not isinstance(observation_space, spaces.Dict):
             raise ValueError(
                 f"The challenger needs a Dict observation space, got {observation_space}. Wrap the environment, for "
                 "example with gymnasium.wrappers.TransformObservation or a wrapper that returns {'state': observation}."
             )
         self.squash = squash
-        chosen = self._choose(observation_space, keys)
+        chosen = self._choose(observation_space, keys, vectors)
         self.image_keys = tuple(key for key in chosen if is_image(observation_space[key]))
         self.vector_keys = tuple(key for key in chosen if key not in self.image_keys)
         self.keys = self.image_keys + self.vector_keys
@@ -86,9 +89,15 @@ class ObservationSpec:
         self.vector_dim = sum(self.vector_sizes)
 
     @staticmethod
-    def _choose(space: spaces.Dict, keys: Sequence[str] | None) -> list[str]:
+    def _choose(space: spaces.Dict, keys: Sequence[str] | None, vectors: bool) -> list[str]:
         if keys is None:
-            chosen = [key for key, sub in space.items() if is_image(sub) or is_vector(sub)]
+            chosen = [key for key, sub in space.items() if is_image(sub) or (vectors and is_vector(sub))]
+            if not chosen and not vectors and any(is_vector(sub) for sub in space.values()):
+                raise ValueError(
+                    "No observation key is an image (3-D Box with finite bounds), and the preset's read_vectors=False leaves "
+                    f'vectors out, the space has { {key: str(sub) for key, sub in space.items()} }. Take preset="report", '
+                    "read_vectors=True, or name the vectors in `keys`."
+                )
             if not chosen:
                 raise ValueError(
                     "No observation key is usable by the challenger: it reads images (3-D Box with finite bounds) "
