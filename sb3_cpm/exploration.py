@@ -112,8 +112,8 @@ class ExplorationVecEnv(VecEnvWrapper):
         challenger: Challenger,
         epsilon: Callable[[], float],
         last_obs: dict[str, np.ndarray],
-        unit: ExplorationUnit = "step",
-        segment_length: int = 10,
+        unit: ExplorationUnit = "segment",
+        segment_length: int = 20,
         stopwatch: Stopwatch | None = None,
         on_failure: Callable[[], None] = lambda: None,
     ):

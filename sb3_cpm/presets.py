@@ -6,8 +6,8 @@ and of what is made of its challenges (4.3 and B.6).
 vectors, such as the robot's state, and has a continue head; the report has neither. ``"report_images"`` is the report's own
 world model: images only, and two heads, for images and reward. Both leave out the actor-critic for the task, which the report
 trains beside that for exploration (``train_task_behavior=True``), and by which C never acts. The number of ensemble heads is
-not in the report; 10 is ours. ``"default"`` is small enough for two CPU cores: an update takes about 0.1 CPU seconds for
-vectors and 0.15 for two 32x32 cameras. ``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate
+not in the report; 10 is ours. ``"default"`` is small enough for two CPU cores: an update takes about 0.03 CPU seconds for
+vectors and 0.06 for two 32x32 cameras. ``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate
 800 x 15 imagined steps: without a GPU add ``imagination_starts=256``, which needs a third of that. A preset of your own is a
 dict with the entries that
 differ from ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument.
@@ -91,7 +91,7 @@ REPORT: dict[str, Any] = {
 DEFAULT: dict[str, Any] = {
     **REPORT,
     "batch_size": 8,
-    "sequence_length": 32,
+    "sequence_length": 16,
     "cnn_depth": 8,
     "vector_units": 128,
     "stoch_size": 30,
@@ -102,7 +102,10 @@ DEFAULT: dict[str, Any] = {
     "model_lr": 1e-3,
     "actor_lr": 3e-4,
     "critic_lr": 3e-4,
-    "imagination_starts": 64,
+    "horizon": 8,
+    "imagination_starts": 16,
+    "exploration_entropy_scale": 1.0,
+    "noise_memory": 10.0,
     "actor_layers": 2,
     "actor_units": 128,
     "critic_layers": 2,
@@ -118,7 +121,15 @@ DEFAULT: dict[str, Any] = {
 #: The report's own world model, of images alone and without a continue head [B.1].
 REPORT_IMAGES: dict[str, Any] = {**REPORT, "read_vectors": False, "continue_head": False}
 
-PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "report": REPORT, "report_images": REPORT_IMAGES}
+#: The same networks for an agent that learns from its imagination alone, as Dreamer does: larger updates.
+DREAMER: dict[str, Any] = {
+    **DEFAULT,
+    "sequence_length": 32,
+    "horizon": 15,
+    "imagination_starts": 64,
+}
+
+PRESETS: dict[str, dict[str, Any]] = {"default": DEFAULT, "dreamer": DREAMER, "report": REPORT, "report_images": REPORT_IMAGES}
 
 #: Arguments of :class:`~sb3_cpm.buffers.CPMBuffer`: how challenges are used. "report" has its constants, which are the
 #: buffer's defaults, too. "tuned" makes less of challenges: on a dense reward those of the report slow the player down
@@ -160,11 +171,12 @@ _RULES: dict[str, Rule] = {
 }
 
 
-def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -> dict[str, Any]:
+def make_preset(preset: str | Mapping[str, Any] = "default", base: str = "default", **overrides: Any) -> dict[str, Any]:
     """
     A complete preset.
 
-    :param preset: name of a preset, or the entries that differ from "default"
+    :param preset: name of a preset, or the entries that differ from ``base``
+    :param base: name of the preset that entries are filled up from
     :param overrides: further entries, they win. Each replaces a whole entry, `uncertainty` too: give single arguments as
         `uncertainty_kwargs`
     :return: plain Python numbers: NumPy's scalars would make a saved file unreadable
@@ -175,7 +187,7 @@ def make_preset(preset: str | Mapping[str, Any] = "default", **overrides: Any) -
             raise ValueError(f"Unknown preset {preset!r}.{nearest(preset, PRESETS, cutoff=0.0)} Valid: {sorted(PRESETS)}.")
         result = dict(PRESETS[preset])
     elif isinstance(preset, Mapping):
-        result, overrides = dict(DEFAULT), {**preset, **overrides}
+        result, overrides = dict(PRESETS[base]), {**preset, **overrides}
     else:
         raise ValueError(f"`preset` must be a name ({sorted(PRESETS)}) or a dict of entries, got {preset!r}.")
     for key in overrides:

@@ -56,6 +56,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
     }
     #: which behaviour acts
     behavior: ClassVar[str]
+    default_preset: ClassVar[str]
     policy: DreamerPolicy
 
     def __init__(
@@ -88,7 +89,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if source is not None:
             keys = source.keys if keys is None else keys
             preset = {**source.preset, **(preset or {})} if not isinstance(preset, str) else preset
-        sizes = make_preset("default" if preset is None else preset, **entries)
+        sizes = make_preset(self.default_preset if preset is None else preset, self.default_preset, **entries)
         if learning_rate is not None and sizes["model_lr"] == 0.0:
             raise ValueError(
                 f"The preset entry 'model_lr' is 0, which keeps the world model from learning, and `learning_rate`, "

@@ -56,6 +56,7 @@ class Dreamer(DreamerAlgorithm):
     """
 
     behavior: ClassVar[str] = "task"
+    default_preset: ClassVar[str] = "dreamer"
 
     def __init__(
         self,

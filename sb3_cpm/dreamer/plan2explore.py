@@ -59,6 +59,7 @@ class Plan2Explore(DreamerAlgorithm):
     """
 
     behavior: ClassVar[str] = "exploration"
+    default_preset: ClassVar[str] = "default"
 
     def __init__(
         self,

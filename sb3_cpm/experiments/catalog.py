@@ -70,6 +70,33 @@ ZOO_SDE = Contender(
     },
 )
 PINK = Contender("SAC, pink noise", "sac", {"policy": "sb3_cpm.zoo.pink_noise.PinkNoisePolicy"})
+PRINTED = Contender(
+    "CPM-SAC, printed F and R",
+    "cpm_sac",
+    {
+        "replay_buffer_kwargs": {
+            "reward_origin": "zero",
+            "filter_kwargs": {"self_balancing": "always"},
+            "reward_kwargs": {"keep_mean": False, "zero_reward_size": None},
+        }
+    },
+)
+#: Updates as large and as seldom as they were before they became cheap, with white noise.
+FORMER = Contender(
+    "CPM-SAC, seldom large updates",
+    "cpm_sac",
+    challenger(
+        train_freq=25,
+        decay_kwargs={"start": 0.9, "floor": 0.05},
+        challenger_kwargs={
+            "sequence_length": 32,
+            "horizon": 15,
+            "imagination_starts": 64,
+            "exploration_entropy_scale": 1e-4,
+            "noise_memory": 0.0,
+        },
+    ),
+)
 CPM_RND = Contender("CPM-SAC, RND", "cpm_sac", challenger(uncertainty_class="rnd"))
 DREAMER = Contender("Dreamer", "dreamer")
 PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
@@ -158,7 +185,7 @@ _ALL = (
         "",
         "MountainCarContinuous-v0: how soon the reward is found",
         "not in the report: explorers beside each other on seeds that nothing was chosen on",
-        (SAC, CPM, CPM_RND, PLAN2EXPLORE, ZOO_SDE, PINK),
+        (SAC, CPM, PRINTED, FORMER, CPM_RND, PLAN2EXPLORE, ZOO_SDE, PINK),
         "curves",
         Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 10, {}, "1 (SAC) to 3 CPU minutes per run, by processor", 10),
         Plan((MOUNTAINCAR,), 2_000, 1_000, 3, 1, {}, "1 minute on 2 cores", 10),

@@ -80,8 +80,8 @@ class TrainSettings:
     n_envs: int = 1
     algorithm: str = "sac"
     preset: str = "default"
-    decay: str = "exponential"
-    unit: str = "step"
+    decay: str = "linear"
+    unit: str = "segment"
     challenge_ratio: float = 0.25
     buffer_size: int | None = None
     batch_size: int = 64
@@ -92,7 +92,7 @@ class TrainSettings:
     train_freq: int = 1
     gradient_steps: int = 1
     learning_starts: int | None = None
-    challenger_train_freq: int = 25
+    challenger_train_freq: int = 8
     challenger_gradient_steps: int = 1
     evaluations: int = 6
     eval_episodes: int = 5
