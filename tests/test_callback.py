@@ -219,7 +219,7 @@ def test_save_load_continue(tmp_path):
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert loaded.replay_buffer.coefficients == coefficients
     assert len(loaded.replay_buffer.challenges) == len(model.replay_buffer.challenges)
-    resumed = make_callback(load_path=tmp_path / "challenger.pt", decay_steps=600)
+    resumed = make_callback(load_path=tmp_path / "challenger.pt", decay="exponential", decay_steps=600)
     loaded.learn(200, callback=resumed, reset_num_timesteps=False)
     assert loaded.num_timesteps == 600 and resumed.epsilon == pytest.approx(0.05 + 0.75 * np.exp(-5.0))
     assert resumed.challenger.trained_updates > callback.challenger.trained_updates
@@ -312,7 +312,7 @@ def test_episodes_too_short_for_any_challenge_are_told_of_once(length, warmup_st
 def learn_in_portions(portions, **kwargs):
     """:return: share of the actions that C gave in 600 steps, and epsilon after each portion"""
     model = make_model(learning_starts=100, train_freq=10)
-    callback = make_callback(**kwargs, gradient_steps=0)
+    callback = make_callback(**kwargs, unit="step", gradient_steps=0)
     shares, epsilons = [], []
     for _ in range(portions):
         model.learn(600 // portions, callback=callback, reset_num_timesteps=False)
@@ -340,13 +340,13 @@ def test_a_decay_that_begins_again_in_every_portion_is_told_of_once():
 
 def test_a_decay_that_begins_again_after_loading_is_told_of_too(tmp_path):
     model = make_model(train_freq=10)
-    model.learn(150, callback=make_callback(gradient_steps=0))
+    model.learn(150, callback=make_callback(decay="exponential", gradient_steps=0))
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     loaded = SAC.load(tmp_path / "model", toy())
     loaded.load_replay_buffer(tmp_path / "buffer")
     with pytest.warns(UserWarning, match="had fallen to 0.0551 and begins again at 0.112"):
-        loaded.learn(150, callback=make_callback(gradient_steps=0), reset_num_timesteps=False)
+        loaded.learn(150, callback=make_callback(decay="exponential", gradient_steps=0), reset_num_timesteps=False)
 
 
 def test_starting_anew_begins_the_decay_anew_without_a_word():
@@ -529,7 +529,7 @@ def test_hindsight_goes_on_in_new_environments_after_a_process_died():
     """As the message of the error promises."""
     env = SubprocVecEnv([Goals])
     model = make_model(env, learning_starts=30, train_freq=7, buffer_kwargs=dict(n_sampled_goal=4))
-    callback = make_callback()
+    callback = make_callback(decay="constant")
     with pytest.raises(RuntimeError, match=r"goes on after model.set_env\(\)"):
         model.learn(100, callback=[callback, RaisesAt(60, lambda: env.processes[0].kill())])
     demonstrated = [Goals().reset()[0] for _ in range(6)]
@@ -550,7 +550,7 @@ def test_how_often_c_trains_does_not_depend_on_the_length_of_rollouts(n_envs, pl
     """Every 10 steps over all environments, from the end of learning_starts on; there is no backlog of the steps before."""
     learning_starts = 100 * n_envs
     model = make_model(toy(n_envs=n_envs), learning_starts=learning_starts, train_freq=player, buffer_size=20_000)
-    callback = make_callback()
+    callback = make_callback(decay="constant")
     model.learn(learning_starts + 400, callback=callback)
     updates = callback.challenger.trained_updates
     assert updates == pytest.approx(expected, abs=1)
@@ -561,7 +561,7 @@ def test_how_often_c_trains_does_not_depend_on_the_length_of_rollouts(n_envs, pl
 
 def test_the_moments_at_which_c_trains_with_short_rollouts():
     """One environment, one step at a time: the first update after learning_starts, then every train_freq steps."""
-    moments, model, callback = [], make_model(), make_callback(train_freq=13, gradient_steps=2)
+    moments, model, callback = [], make_model(), make_callback(train_freq=13, gradient_steps=2, decay="constant")
 
     class Counts(BaseCallback):
         def _on_rollout_end(self):
