@@ -710,6 +710,13 @@ def test_jobs_and_seeds_are_checked(tmp_path):
 # ---------------------------------------------------------------------- names, statistics, catalog
 
 
+def test_what_only_reads_results_does_without_pytorch():
+    """Whose import costs more than drawing a figure."""
+    script = "import sys, sb3_cpm.experiments.figures; print({'torch', 'stable_baselines3', 'rl_zoo3'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "set()", done.stderr
+
+
 def test_misspelt_names(tmp_path, capsys):
     with pytest.raises(ValueError, match="Did you mean 'mountaincar'"):
         find_experiment("montaincar")
