@@ -37,8 +37,8 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """
     What ``-n auto`` means: a worker per core, but no more than there are files to share out.
 
-    Not pytest-xdist's own answer: it counts physical cores, and starts a worker (10 CPU seconds of imports) even where there is
-    nothing to share. 0, for a single file or a single core, is no worker at all.
+    Not pytest-xdist's own answer: it counts physical cores, and starts a worker (10 CPU seconds of imports) even where there
+    is nothing to share. 0, for a single file or a single core, is no worker at all.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     paths = [Path(argument.split("::")[0]) for argument in config.args]
