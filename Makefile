@@ -2,7 +2,8 @@
 #
 #   PYTHON=python3.11   the interpreter that .venv is made from (default: the first of 3.10 to 3.12 that is found)
 #   ENV=active          use the environment that is active instead of .venv, and install nothing
-#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest
+#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest: a file,
+#                       -m "not slow" (a third of the time), -n 0 (everything in one process)
 #   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
 SHELL := /bin/bash
 .DEFAULT_GOAL := help

@@ -17,12 +17,18 @@ from stable_baselines3.common.utils import set_random_seed
 
 th.set_num_threads(1)
 
-#: Files that take longest, the longest first: begun at the end, one of them would keep a single core busy alone.
+#: Files of more than 30 CPU seconds, the longest first: begun at the end, one of them would keep a single core busy alone.
 LONGEST = (
     "test_notebooks.py",
     "test_zoo.py",
     "test_tasks.py",
+    "test_behavior.py",
     "test_experiments.py",
+    "test_callback.py",
+    "test_sb3_own_tests.py",
+    "test_uncertainty_classes.py",
+    "test_run.py",
+    "test_rendering.py",
 )
 
 

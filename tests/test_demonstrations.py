@@ -291,6 +291,7 @@ def test_files_that_cannot_be_read(broken, tmp_path):
     assert buffer.demonstrations is None
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_states_are_recorded_without_a_renderer(tmp_path):
     environment = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent.json")
@@ -299,6 +300,7 @@ def test_states_are_recorded_without_a_renderer(tmp_path):
     assert child.returncode == 0 and (tmp_path / "scripted.h5").exists(), child.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_scripted_pickcube_is_recorded_and_replayed(tmp_path):
     """Recorded in state mode, as ManiSkill's own demonstrations are; replayed with images and clouds."""

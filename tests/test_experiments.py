@@ -644,6 +644,7 @@ def test_a_crashed_run_is_recorded_and_the_others_go_on(tmp_path, tiny_experimen
     assert main(["reproduce", "--figure", "broken", "--seeds", "1", "--jobs", "0", "--results", str(tmp_path)]) == 1
 
 
+@pytest.mark.slow
 def test_processes_of_their_own(tmp_path):
     """Two at a time; one is killed from outside."""
     specs = [make_spec(seed=0, steps=80), make_spec(seed=1, steps=10_000_000)]

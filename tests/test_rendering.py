@@ -116,6 +116,7 @@ def test_a_failed_import_of_opencv_leaves_nothing(monkeypatch: pytest.MonkeyPatc
     assert sys.path == ["/site-packages"] and not hasattr(sys, "OpenCV_LOADER")
 
 
+@pytest.mark.slow
 # ---------------------------------------------------------------------- the real renderer
 @pytest.mark.maniskill
 def test_probe_and_set_up_where_rendering_works(capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,6 +127,7 @@ def test_probe_and_set_up_where_rendering_works(capsys: pytest.CaptureFixture[st
     assert "SAPIEN renders" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_a_machine_without_vulkan_gets_the_cure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     for name, value in NOWHERE.items():

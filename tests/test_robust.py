@@ -386,6 +386,7 @@ def test_a_training_run_goes_on_without_a_worker_that_died(tmp_path: Path) -> No
     assert summary.steps == 300 and summary.outcome == "finished"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="groups of processes")
 def test_ctrl_c_in_a_training_run_with_workers(tmp_path: Path) -> None:
     """A terminal sends it to all processes at once: the workers wait for the end, nobody takes their silence for a death."""
