@@ -2,12 +2,14 @@
 #
 #   PYTHON=python3.11   the interpreter that .venv is made from (default: the first of 3.10 to 3.12 that is found)
 #   ENV=active          use the environment that is active instead of .venv, and install nothing
-#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest
+#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest: a file,
+#                       -m "not slow" (a third of the time), -n 0 (everything in one process)
 #   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
 VENV := .venv
+SB3_TESTS := .sb3_tests
 EXTRAS := run,maniskill,contrib,tests,dev
 CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
 
@@ -28,6 +30,7 @@ export OMP_NUM_THREADS ?= 1
 help:
 	@echo "make train           set up, train CPM-SAC on PickCube-v1, leave a folder of results in runs/"
 	@echo "make pytest          set up, run all tests"
+	@echo "make sb3-tests       fetch SB3's own tests, which \`make pytest\` runs with our buffer, too, where they are"
 	@echo "make doctor          what works here and what is missing"
 	@echo "make type lint format check-codestyle commit-checks"
 	@echo "make venv, make clean-venv"
@@ -35,8 +38,18 @@ help:
 train: $(READY) $(RENDERING)
 	$(RUN) sb3_cpm train $(ARGS)
 
+# Workers share the cores; tests/conftest.py says how many: none for a single file. `-p no:xdist` takes the option away, too.
 pytest: $(READY) $(RENDERING)
-	$(RUN) pytest $(ARGS)
+	$(RUN) pytest $(if $(findstring no:xdist,$(ARGS)),,-n auto) $(ARGS)
+
+# They are in SB3's source distribution only. `make pytest` runs those of the version that is installed once they are here.
+sb3-tests: $(READY)
+	@version="$$($(BIN)python -c 'from importlib.metadata import version; print(version("stable-baselines3"))')" && \
+		if [ ! -e "$(SB3_TESTS)/stable_baselines3-$$version.tar.gz" ]; then \
+			echo "==> Fetching the tests of stable-baselines3 $$version"; \
+			$(RUN) pip download --quiet --disable-pip-version-check $(PIP_ARGS) --no-deps --no-binary stable-baselines3 \
+				--dest "$(SB3_TESTS)" "stable-baselines3==$$version"; \
+		fi
 
 doctor: $(READY)
 	$(RUN) sb3_cpm doctor
@@ -80,4 +93,4 @@ commit-checks: format type lint
 clean-venv:
 	rm -rf $(VENV)
 
-.PHONY: help train pytest doctor venv rendering type lint format check-codestyle commit-checks clean-venv
+.PHONY: help train pytest sb3-tests doctor venv rendering type lint format check-codestyle commit-checks clean-venv

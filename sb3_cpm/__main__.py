@@ -194,14 +194,14 @@ def _watch(**arguments: Any) -> int:
 def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
     try:
         from sb3_cpm import experiments
-    except ImportError as error:
+
+        if list or figure is None:
+            print(experiments.listing())
+            return 0
+        return experiments.reproduce(figure, **arguments)
+    except ImportError as error:  # also of what only the runs need: they are counted before anything else is done
         cure = 'pip install "sb3_cpm[experiments]"'
         raise RuntimeError(f"Experiments need a package that is missing ({error}): {cure}") from error
-    if list or figure is None:
-        print(experiments.listing())
-        return 0
-    try:
-        return experiments.reproduce(figure, **arguments)
     except BrokenPipeError:
         raise
     except OSError as error:  # a disk that is full or must not be written; what was written before stays

@@ -159,6 +159,7 @@ def square_challenger(square: MovingSquare) -> Challenger:
     return Challenger(square.space, box(2), device="cpu", preset=preset)
 
 
+@pytest.mark.slow
 def test_a_trained_world_model_predicts_frames_it_has_not_seen() -> None:
     """After five frames it predicts the next ten from the actions alone, on held-out episodes."""
     square, rng = MovingSquare(), np.random.default_rng(0)
@@ -184,6 +185,7 @@ def test_a_trained_world_model_predicts_frames_it_has_not_seen() -> None:
     assert metrics["reward_loss"] < 0.02
 
 
+@pytest.mark.slow
 def test_disagreement_is_lower_on_data_seen_often() -> None:
     """Trained on a square that stays on the left, it finds the right half of the image new."""
     square, rng = MovingSquare(), np.random.default_rng(0)

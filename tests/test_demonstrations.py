@@ -291,14 +291,16 @@ def test_files_that_cannot_be_read(broken, tmp_path):
     assert buffer.demonstrations is None
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_states_are_recorded_without_a_renderer(tmp_path):
     environment = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent.json")
     command = [sys.executable, "-m", "sb3_cpm.envs.scripted", str(tmp_path), "--episodes", "1"]
-    child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert child.returncode == 0 and (tmp_path / "scripted.h5").exists(), child.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_scripted_pickcube_is_recorded_and_replayed(tmp_path):
     """Recorded in state mode, as ManiSkill's own demonstrations are; replayed with images and clouds."""

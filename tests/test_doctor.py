@@ -66,7 +66,7 @@ def test_without_maniskill_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_submodules_are_attributes() -> None:
     code = "import sb3_cpm; print(sb3_cpm.buffers.CPMBuffer is sb3_cpm.CPMBuffer, hasattr(sb3_cpm, 'nonsense'))"
-    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=600)
     assert child.stdout.strip() == "True False", child.stderr
 
 
@@ -86,7 +86,7 @@ except ImportError as error:
     assert "pip install 'sb3_cpm[maniskill]'" in str(error), error
     print("said so")
 """
-    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120)
+    child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=600)
     assert child.stdout.strip() == "said so", child.stderr
 
 
@@ -95,7 +95,7 @@ def test_a_broken_torch_is_a_finding(tmp_path: Path) -> None:
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch/__init__.py").write_text("raise OSError('libcudnn.so.9: cannot open shared object file')")
     path = os.pathsep.join((str(tmp_path), str(Path(doctor.__file__).parents[1])))
-    run = partial(subprocess.run, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=120)
+    run = partial(subprocess.run, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=600)
     child = run([sys.executable, "-m", "sb3_cpm", "doctor"])
     assert "FAIL  torch                 libcudnn.so.9" in child.stdout, child.stderr
     assert "Not well: " in child.stdout and child.returncode == 1

@@ -89,7 +89,7 @@ def test_missing_assets_never_prompt(tmp_path: Path, leftover: bool) -> None:
     try:
         assert child.stdout is not None
         output = child.stdout.read()
-        assert child.wait(timeout=120) == 0
+        assert child.wait(timeout=600) == 0
     finally:
         child.kill()
         child.communicate()

@@ -2,6 +2,7 @@
 
 import ast
 import base64
+import importlib
 import os
 import re
 import shutil
@@ -21,7 +22,7 @@ IDS = [path.stem for path in NOTEBOOKS]
 #: Those that show or simulate the robot.
 WITH_ROBOT = ("02_baselines", "09_controllers", "10_pickcube_state_and_hard_exploration")
 MOST_KB, MOST_KB_IN_ALL = 700, 3000
-SECONDS = 600
+SECONDS = 3600
 # /home/..., C:\..., but neither URLs nor fractions
 ABSOLUTE_PATH = re.compile(r"(?<![\w.:/])/(home|root|tmp|usr|opt|mnt|work|var|Users)/|\b[A-Z]:\\\\")
 
@@ -97,9 +98,27 @@ def test_figures_are_explained(path):
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """Of all notebooks: several draw the runs of one experiment."""
-    return tmp_path_factory.mktemp("results")
+def client(tmp_path_factory):
+    """
+    Of one kernel for all notebooks: a minute would be spent on importing PyTorch and ManiSkill ten times.
+
+    A process that the machine has no time for must not look like one that failed: the six decays of notebook 05, the longest
+    cell of all, take a minute of CPU time, and on a machine that many share more than the ten minutes that a cell once had. So
+    limits are only for what hangs. And matplotlib says so in a notebook if it takes it 5 s to look for fonts, so it does here.
+    """
+    importlib.import_module("matplotlib.font_manager")
+    results = tmp_path_factory.mktemp("results")  # of all notebooks: several draw the runs of one experiment
+    search = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": search, "SB3_CPM_QUICK": "1", "SB3_CPM_RESULTS": str(results)}
+    environment.pop("MPLBACKEND", None)  # Jupyter's own
+    client = nbclient.NotebookClient(
+        nbformat.v4.new_notebook(),
+        kernel_name="python3",
+        **dict.fromkeys(("timeout", "startup_timeout", "iopub_timeout"), SECONDS),
+        raise_on_iopub_timeout=True,  # else outputs that come later are lost without a word
+    )
+    with client.setup_kernel(env=environment):
+        yield client
 
 
 @pytest.mark.slow
@@ -111,7 +130,7 @@ def results(tmp_path_factory):
     ],
 )
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning", "ignore::RuntimeWarning:zmq.*")
-def test_runs_from_a_clean_kernel(path, tmp_path, results):
+def test_runs_from_a_clean_kernel(path, tmp_path, client):
     copy = tmp_path / "notebooks" / path.name
     copy.parent.mkdir()
     shutil.copy(path, copy)
@@ -119,12 +138,11 @@ def test_runs_from_a_clean_kernel(path, tmp_path, results):
     for cell in notebook.cells:  # a clean one: nothing is left of what is stored
         if cell.cell_type == "code":
             cell.outputs, cell.execution_count = [], None
-    search = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": search, "SB3_CPM_QUICK": "1", "SB3_CPM_RESULTS": str(results)}
-    environment.pop("MPLBACKEND", None)  # Jupyter's own
-    client = nbclient.NotebookClient(
-        notebook, timeout=SECONDS, kernel_name="python3", resources={"metadata": {"path": str(copy.parent)}}
-    )
-    client.execute(env=environment)  # raises where a cell does
+    # nor of the notebook before, but for what it imported
+    clean = f"import os; os.chdir({str(copy.parent)!r}); get_ipython().reset()"
+    reply = client.wait_for_reply(client.kc.execute(clean, silent=True))
+    assert reply["content"]["status"] == "ok", reply["content"]
+    client.nb = notebook
+    client.execute(cleanup_kc=False)  # raises where a cell does
     check_outputs(notebook)
     assert list(copy.parent.iterdir()) == [copy], "left something beside itself"

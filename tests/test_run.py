@@ -170,6 +170,7 @@ def test_never_overwrites(finished: tuple[Path, Summary], monkeypatch: pytest.Mo
     assert names == ["CPMToy-v0-sac-seed0", "CPMToy-v0-sac-seed0-2", "CPMToy-v0-sac-seed0-3"]
 
 
+@pytest.mark.slow
 def test_same_seed_same_run_whether_it_is_evaluated_or_not(tmp_path: Path) -> None:
     for name, evaluations in (("one", 0), ("other", 3)):
         train(run_folder=str(tmp_path / name), **{**SMALL, "steps": 300, "evaluations": evaluations, "video": False})
@@ -312,6 +313,7 @@ def test_maniskill_is_told_from_gymnasium() -> None:
     assert not environments.is_maniskill("Pendulum-v1")
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_pick_cube(tmp_path: Path) -> None:
     changes = {"env": "PickCube-v1", "steps": 200, "evaluations": 2, "eval_episodes": 1}

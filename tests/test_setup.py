@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def in_shell(command: str, folder: Path) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True, timeout=120)
+    return subprocess.run(["bash", "-c", command], cwd=folder, capture_output=True, text=True, timeout=600)
 
 
 def test_an_interpreter_may_lie_in_a_folder_with_a_space(tmp_path: Path) -> None:

@@ -221,6 +221,7 @@ for env_id in ("PickSingleYCB-v1", "PickSingleEGAD-v1", "TurnFaucet-v1"):
 """
 
 
+@pytest.mark.slow
 def test_a_file_with_the_wrong_contents_is_an_error_with_the_cure(tmp_path: Path) -> None:
     standin_assets.make_all(tmp_path)
     for pattern in (f"{YCB}/models/*/textured.obj", f"{EGAD}/egad_train_set_coacd/*.obj", "partnet_mobility/shapes/*.obj"):
@@ -246,6 +247,7 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "file"),
     [

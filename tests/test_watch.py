@@ -160,6 +160,7 @@ def test_wrong_arguments_of_the_callback(kwargs: dict[str, int]) -> None:
         WatchCallback(ChallengerCallback(), **kwargs)
 
 
+@pytest.mark.slow
 def test_states_alone_are_drawn_as_curves(tmp_path: Path) -> None:
     train(run_folder=str(tmp_path / "run"), **{**RUN, "env_kwargs": {"keys": ["state"]}})
     watched = watch(tmp_path / "run", episodes=1)

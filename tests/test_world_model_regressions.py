@@ -185,6 +185,7 @@ def test_10_nothing_before_a_reset_matters_after_it() -> None:
     assert torch.equal(rssm.prior(whole.deter[3:]), rssm.prior(again.deter[3:]))
 
 
+@pytest.mark.slow
 def test_10_termination_ends_the_return_and_truncation_bootstraps() -> None:
     """10: is_terminal was ignored, or every end of an episode was taken for a termination."""
     rewards, values = torch.ones(3, 1), torch.full((3, 1), 50.0)

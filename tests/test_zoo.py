@@ -7,7 +7,7 @@ import pickle
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from rl_zoo3.utils import ALGOS
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import BitFlippingEnv
+from warm_python import WarmPython
 
 from sb3_cpm import ChallengerCallback, CPMBuffer
 from sb3_cpm.challenger import Challenger
@@ -43,18 +44,24 @@ from sb3_cpm.zoo.wrappers import RGBD, TerminationIsSuccess, as_dict
 CONFIGS = sorted(config_folder().glob("*.yml"))
 ENTRIES = [(path.stem, name) for path in CONFIGS for name in read_entries(path) if not name.startswith(".")]
 TOY = "CPMToy-v0"
+Command = Callable[[str, list[str], Path], str]
 
 
 def known(env_id: str) -> bool:
     return env_id in gym.registry or env_id == "default"
 
 
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """What importing the bridge brings into a fresh interpreter."""
+    return set(run(["-c", "import sys, sb3_cpm.zoo; print(*sys.modules)"], tmp_path_factory.mktemp("imported")).split())
+
+
 # ---------------------------------------------------------------------- ids and names
-def test_tasks_are_registered_without_importing_maniskill(tmp_path: Path) -> None:
+def test_tasks_are_registered_without_importing_maniskill(imported: set[str]) -> None:
     assert len(ENV_IDS) == 2 * len(TASKS) == 14 and all(env_id in gym.registry for env_id in ENV_IDS)
     assert env_id_of("TurnFaucet-v1", state=True) == "CPM/TurnFaucetState-v1"
-    script = "import sys, sb3_cpm.zoo; print([name for name in ('mani_skill', 'sapien') if name in sys.modules])"
-    assert run(["-c", script], tmp_path).strip() == "[]"
+    assert not imported & {"mani_skill", "sapien"}
 
 
 def test_rl_zoo3_knows_our_names() -> None:
@@ -185,7 +192,11 @@ def run(arguments: list[str], folder: Path, **environment: str) -> str:
     done = subprocess.run(
         command, env=variables, cwd=folder, capture_output=True, text=True, timeout=900, stdin=subprocess.DEVNULL
     )
-    assert done.returncode == 0, f"{' '.join(arguments)}\n{done.stdout[-3000:]}\n{done.stderr[-5000:]}"
+    return check(done)
+
+
+def check(done: "subprocess.CompletedProcess[str]") -> str:
+    assert done.returncode == 0, f"{' '.join(done.args)}\n{done.stdout[-3000:]}\n{done.stderr[-5000:]}"
     return done.stdout
 
 
@@ -588,6 +599,7 @@ def train(folder: Path, n_timesteps: int, **kwargs: Any) -> tuple[Any, Any]:
     return made[0], (manager, start)
 
 
+@pytest.mark.slow
 def test_a_continued_run_goes_on_with_everything(tmp_path: Path) -> None:
     model, (manager, start) = train(tmp_path, 300, save_freq=100, eval_freq=100, n_eval_episodes=1)
     assert start.found["step"] == start.found["updates"] == 0
@@ -854,12 +866,12 @@ def test_errors_of_a_run_keep_their_traceback(tmp_path: Path, capsys: pytest.Cap
 COMMON = ["--device", "cpu", "--eval-episodes", "2", "--save-replay-buffer", "-tb", "tb"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", ["ours", "theirs"])
-def test_gymnasium_robotics_is_imported_where_it_is_needed(program: str, tmp_path: Path) -> None:
+def test_gymnasium_robotics_is_imported_where_it_is_needed(program: str, imported: set[str], tmp_path: Path) -> None:
     pytest.importorskip("gymnasium_robotics")
     pytest.importorskip("mujoco")
-    script = "import sys, sb3_cpm.zoo; print([name for name in ('gymnasium_robotics', 'mujoco') if name in sys.modules])"
-    assert run(["-c", script], tmp_path).strip() == "[]"
+    assert "sb3_cpm.zoo" in imported and not imported & {"gymnasium_robotics", "mujoco"}
     end = ["--env", "PointMaze_UMaze-v3", "-n", "60", "-f", "logs", "--device", "cpu", "--eval-freq", "-1"]
     if program == "ours":
         run(["-m", "sb3_cpm.zoo", "train", "--agent", "sac_her", *end], tmp_path)
@@ -870,8 +882,20 @@ def test_gymnasium_robotics_is_imported_where_it_is_needed(program: str, tmp_pat
     assert (tmp_path / "logs" / "sac" / "PointMaze_UMaze-v3_1" / "PointMaze_UMaze-v3.zip").exists()
 
 
-RL_ZOO3 = ["-m", "rl_zoo3.{command}", "--gym-packages", "sb3_cpm.zoo"]
-OURS = ["-m", "sb3_cpm.zoo", "{command}"]
+@pytest.fixture(scope="module")
+def warm() -> Iterator[Command]:
+    """Runs a module in a folder, and gives back what it printed; it must end well."""
+    python = WarmPython()
+
+    def run_warm(module: str, arguments: list[str], folder: Path) -> str:
+        return check(python.run(module, arguments, folder))
+
+    yield run_warm
+    python.close()
+
+
+RL_ZOO3 = ["rl_zoo3.{command}", "--gym-packages", "sb3_cpm.zoo"]
+OURS = ["sb3_cpm.zoo", "{command}"]
 SMALL = "env_kwargs:dict(ignore_terminations=True, n_points=0, image_size=32, max_episode_steps=10)"
 #: program, algorithm, environment, steps of the first run, of its continuation, what makes them short, length of an episode
 CHAINS = {
@@ -891,12 +915,12 @@ CHAINS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer"])
-def test_train_enjoy_resume_plot(name: str, tmp_path: Path) -> None:
+def test_train_enjoy_resume_plot(name: str, warm: Command, tmp_path: Path) -> None:
     program, algo, env_id, n_steps, n_more, parameters, length = CHAINS[name]
 
     def command(what: str, *arguments: str) -> str:
-        start = [word.format(command=what) for word in program]
-        return run([*start, "--algo", algo, "--env", env_id, "-f", name, *arguments], tmp_path)
+        module, *start = [word.format(command=what) for word in program]
+        return warm(module, [*start, "--algo", algo, "--env", env_id, "-f", name, *arguments], tmp_path)
 
     config = ["--conf-file", str(config_folder() / f"{name}.yml"), "-params", *parameters, *COMMON]
     output = command("train", *config, "-n", str(n_steps), "--eval-freq", str(n_steps // 2), "--seed", "1")
@@ -914,22 +938,22 @@ def test_train_enjoy_resume_plot(name: str, tmp_path: Path) -> None:
     assert f"Going on at step {n_steps}" in output and "WARNING" not in output
     with np.load(second / "evaluations.npz") as log:
         assert log["timesteps"].tolist() == [n_steps // 2, n_steps, n_steps + n_more // 2, n_steps + n_more]
-    plots = ["-m", "rl_zoo3.cli", "all_plots", "-a", algo, "-e", file_name, "-f", name, "-l", name, "--no-display"]
+    plots = ["all_plots", "-a", algo, "-e", file_name, "-f", name, "-l", name, "--no-display"]
     if name == "cpm_sac":
         # rliable wants two seeds; with as many evaluations, since rl_zoo3 plots the longest runs only
         total = n_steps + n_more
         command("train", *config, "-n", str(total), "--eval-freq", str(total // 4), "--seed", "2")
-        assert f"|{file_name}|" in run([*plots, "-k", "successes"], tmp_path).replace(" ", "")
-    output = run([*plots, "--no-million", "-print", "-o", "curves"], tmp_path)
+        assert f"|{file_name}|" in warm("rl_zoo3.cli", [*plots, "-k", "successes"], tmp_path).replace(" ", "")
+    output = warm("rl_zoo3.cli", [*plots, "--no-million", "-print", "-o", "curves"], tmp_path)
     assert f"{file_name}-{algo.upper()}-{name}: {2 if name == 'cpm_sac' else 1}" in output
     if name == "cpm_sac":
-        run(["-m", "rl_zoo3.cli", "plot_from_file", "-i", "curves.pkl", "-r", "-iqm", "-l", name], tmp_path)
+        warm("rl_zoo3.cli", ["plot_from_file", "-i", "curves.pkl", "-r", "-iqm", "-l", name], tmp_path)
 
 
 @pytest.mark.slow
-def test_optimize_and_train_with_a_trial(tmp_path: Path) -> None:
+def test_optimize_and_train_with_a_trial(warm: Command, tmp_path: Path) -> None:
     config = str(config_folder() / "cpm_sac.yml")
-    start = ["-m", "rl_zoo3.train", "--gym-packages", "sb3_cpm.zoo", "--algo", "sac", "--env", TOY, "--conf-file", config]
+    start = ["--gym-packages", "sb3_cpm.zoo", "--algo", "sac", "--env", TOY, "--conf-file", config]
     start += ["-f", "logs", "--device", "cpu", "--storage", "study.log", "--study-name", "s", "-params", "learning_starts:100"]
     searching = [
         "-n",
@@ -943,12 +967,12 @@ def test_optimize_and_train_with_a_trial(tmp_path: Path) -> None:
         "1",
         "--no-optim-plots",
     ]
-    output = run([*start, *searching, "--sampler", "random", "--seed", "3"], tmp_path)
+    output = warm("rl_zoo3.train", [*start, *searching, "--sampler", "random", "--seed", "3"], tmp_path)
     assert "Number of finished trials:  2" in output
     report = next((tmp_path / "logs" / "sac").glob("report_*.csv")).read_text()
     assert report.count("COMPLETE") == 2
     assert all(f"params_{name}" in report for name in (*search.BUFFER_SPACE, *search.CALLBACK_SPACE, "net_arch"))
-    run([*start, "-n", "110", "--eval-freq", "-1", "--trial-id", "1"], tmp_path)
+    warm("rl_zoo3.train", [*start, "-n", "110", "--eval-freq", "-1", "--trial-id", "1"], tmp_path)
     saved = next((tmp_path / "logs" / "sac").glob(f"{TOY}_*/{TOY}/config.yml")).read_text()
     values = dict(yaml.unsafe_load(saved))
     assert search.OURS not in values and {"challenge_ratio", "mix"} <= set(values["replay_buffer_kwargs"])

@@ -8,8 +8,7 @@ The experiments of the report: runs as data, results as tidy CSV, figures from t
 
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
 from sb3_cpm.experiments.reports import draw, ensure_data, find_data, listing, reproduce, run_experiment, summary_table
-from sb3_cpm.experiments.single_run import RunResult
-from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
+from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunResult, RunSpec, Task
 
 __all__ = [
     "EXPERIMENTS",

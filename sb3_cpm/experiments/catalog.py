@@ -9,9 +9,9 @@ Short versions run on the robot, for as long as two cores can bear, and on tasks
 from dataclasses import replace
 from typing import Any
 
+from sb3_cpm.arguments import nearest
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, Task
 from sb3_cpm.presets import CHALLENGES
-from sb3_cpm.zoo.agents import nearest
 
 
 def challenger(**kwargs: Any) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sb3_cpm.experiments.run_folder import CRASHED, LockedError, OtherResultError, is_finished, write_crashed
-from sb3_cpm.experiments.single_run import RunResult, perform
-from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.specification import RunResult, RunSpec
 from sb3_cpm.experiments.stored_run import DamagedRunError
 
 Tell = Callable[[str], None]
@@ -46,6 +45,8 @@ def perform_all(
 
 def attempt(spec: RunSpec, results: Path, tell: Tell = print, device: str = "cpu") -> RunResult:
     """As :func:`~sb3_cpm.experiments.single_run.perform`, but whatever goes wrong becomes a result."""
+    from sb3_cpm.experiments.single_run import perform  # brings PyTorch, which nobody needs who only draws
+
     folder = spec.folder(results)
     try:
         return perform(spec, results, tell, device)

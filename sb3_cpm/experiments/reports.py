@@ -10,10 +10,8 @@ import pandas as pd
 from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
 from sb3_cpm.experiments.collect import collect, has_data
 from sb3_cpm.experiments.grid import perform_all
-from sb3_cpm.experiments.single_run import RunResult
-from sb3_cpm.experiments.specification import Experiment, of_version
+from sb3_cpm.experiments.specification import Experiment, RunResult, of_version
 from sb3_cpm.experiments.statistics import estimate, per_seed
-from sb3_cpm.run.plots import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -195,6 +193,8 @@ def reproduce(
     :return: exit status: 1 if a run crashed or was refused, or its result is there and could not be checked
     :raises ValueError: as :func:`run_experiment` and :func:`draw`
     """
+    from sb3_cpm.run.plots import save_figure  # first: nobody wants to hear after the runs that matplotlib is missing
+
     experiment = find_experiment(name)
     version = experiment.trial(version, steps)
     if Path(results).exists() and not Path(results).is_dir():

@@ -19,15 +19,17 @@ import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from sb3_cpm import __version__
 from sb3_cpm.experiments.specification import RunSpec, fingerprint
-from sb3_cpm.run.evaluation import FIRST_SEED
 from sb3_cpm.run.folder import versions, write_text, write_yaml
-from sb3_cpm.zoo.agents import Agent
+from sb3_cpm.run.settings import FIRST_SEED
+
+if TYPE_CHECKING:
+    from sb3_cpm.zoo.agents import Agent
 
 CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
 
@@ -40,7 +42,7 @@ class LockedError(RuntimeError):
     """Another process is writing a folder."""
 
 
-def description(spec: RunSpec, agent: Agent) -> dict[str, Any]:
+def description(spec: RunSpec, agent: "Agent") -> dict[str, Any]:
     """:return: what ``config.yml`` holds: the protocol, its fingerprint, and the versions"""
     protocol = {
         "algo": agent.algo,

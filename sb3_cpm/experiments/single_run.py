@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -15,34 +15,18 @@ from sb3_cpm import __version__
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.experiments import checkpoint as checkpoints
 from sb3_cpm.experiments import run_folder
+from sb3_cpm.experiments.diagnostics import DiagnosticsWriter
 from sb3_cpm.experiments.evaluation import evaluate, success_of
 from sb3_cpm.experiments.player_losses import log_player_losses
-from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.experiments.specification import RunResult, RunSpec
 from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
-from sb3_cpm.experiments.tables import COLUMNS, DiagnosticsWriter, Table
+from sb3_cpm.experiments.tables import COLUMNS, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.run.settings import check_seed
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
 N_DUMPS = 50
-
-
-class RunResult(NamedTuple):
-    """
-    What became of a run.
-
-    :param spec: the run
-    :param outcome: ``"finished"``, ``"skipped"`` (its result was there), ``"unchecked"`` (it was there, but what is asked for
-        cannot be read, to compare them), ``"refused"`` or ``"crashed"``
-    :param message: what else there is to say
-    :param folder: where its results are
-    """
-
-    spec: RunSpec
-    outcome: str
-    message: str
-    folder: Path
 
 
 def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda news: None, device: str = "cpu") -> RunResult:

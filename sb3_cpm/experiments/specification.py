@@ -1,14 +1,14 @@
-"""What a run and an experiment are: plain data."""
+"""What a run, its outcome and an experiment are: plain data."""
 
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sb3_cpm.arguments import nearest
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.run.settings import FIRST_SEED
 
 #: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.
 VERSIONS = ("full", "short", "quick")
@@ -69,6 +69,23 @@ class RunSpec:
     def as_dict(self) -> dict[str, Any]:
         """:return: plain data"""
         return asdict(self)
+
+
+class RunResult(NamedTuple):
+    """
+    What became of a run.
+
+    :param spec: the run
+    :param outcome: ``"finished"``, ``"skipped"`` (its result was there), ``"unchecked"`` (it was there, but what is asked for
+        cannot be read, to compare them), ``"refused"`` or ``"crashed"``
+    :param message: what else there is to say
+    :param folder: where its results are
+    """
+
+    spec: RunSpec
+    outcome: str
+    message: str
+    folder: Path
 
 
 def fingerprint(protocol: dict[str, Any]) -> str:

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from stable_baselines3.common.logger import KVWriter
-
 EVALUATIONS = (
     "experiment",
     "agent",
@@ -72,22 +70,3 @@ def _cell(value: Any) -> Any:
     if isinstance(value, bool):
         return int(value)
     return f"{value:.6g}" if isinstance(value, float) else value
-
-
-class DiagnosticsWriter(KVWriter):
-    """
-    SB3 logger output: every number that is logged, as rows ``step, name, value``.
-
-    :param table: where they go
-    """
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        for name, value in sorted(key_values.items()):
-            if not name.startswith("time/") and hasattr(value, "__float__"):
-                self.table.add((step, name, float(value)))
-
-    def close(self) -> None:
-        self.table.close()

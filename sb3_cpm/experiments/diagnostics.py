@@ -1,0 +1,26 @@
+"""What SB3 logs, as a table. Apart from the tables themselves, which are read without SB3."""
+
+from typing import Any
+
+from stable_baselines3.common.logger import KVWriter
+
+from sb3_cpm.experiments.tables import Table
+
+
+class DiagnosticsWriter(KVWriter):
+    """
+    SB3 logger output: every number that is logged, as rows ``step, name, value``.
+
+    :param table: where they go
+    """
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        for name, value in sorted(key_values.items()):
+            if not name.startswith("time/") and hasattr(value, "__float__"):
+                self.table.add((step, name, float(value)))
+
+    def close(self) -> None:
+        self.table.close()
