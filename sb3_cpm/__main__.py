@@ -46,6 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except OSError as error:
+        from sb3_cpm.files import NotWrittenError
+
+        if not isinstance(error, NotWrittenError):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -14,6 +14,7 @@ import contextlib
 import errno
 import glob
 import hashlib
+import io
 import json
 import logging
 import os
@@ -21,7 +22,7 @@ import re
 import secrets
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,21 @@ def write_bytes(path: str | os.PathLike, content: bytes) -> None:
 def write_text(path: str | os.PathLike, text: str) -> None:
     """:raises NotWrittenError: see :func:`replacing`"""
     write_bytes(path, text.encode())
+
+
+def write_sealed(path: str | os.PathLike, write: Callable[[io.BytesIO], Any]) -> None:
+    """
+    Write a zip archive that somebody else makes, with the digest of its bytes.
+
+    :param path: of the file
+    :param write: is given a file in memory (what torch says of a disk that is full does not name the disk)
+    :raises NotWrittenError: see :func:`replacing`
+    """
+    file = io.BytesIO()
+    write(file)
+    with replacing(path) as temporary:
+        temporary.write_bytes(file.getbuffer())
+        seal(temporary)
 
 
 def _claim(target: Path) -> tuple[Path, int]:
@@ -318,13 +334,13 @@ def verify(path: str | os.PathLike, what: str = "file") -> bool:
             return True
         try:
             with zipfile.ZipFile(file) as archive:
-                broken = archive.testzip()
+                broken = "digest" if len(archive.comment) == _SEAL else archive.testzip()
         except Exception as error:  # of damaged archives zipfile, zlib and struct each complain in their own way
             raise DamagedFileError(
                 f"{path} ({size:,} bytes) is damaged or no saved {what} ({type(error).__name__}: {error}). {_EARLIER}"
             ) from error
     if broken is not None:
-        raise DamagedFileError(f"{path} is damaged: its part {broken} has changed since it was written. {_EARLIER}")
+        raise DamagedFileError(f"{path} is damaged: its {broken} has changed since it was written. {_EARLIER}")
     return False
 
 

@@ -47,8 +47,8 @@ def pack(value: Any, classes: Collection[type] = (), name: str = "") -> Any:
         packed = {key: pack(part, classes, f"{name}.{key}") for key, part in fields.items()}
         return {_KIND: "dataclass", "name": type(value).__name__, "fields": packed}
     raise ValueError(
-        f"{name} is a {type(value).__name__} ({value!r:.60}), which a file without pickles cannot hold. Numbers, texts, arrays, "
-        "and lists, tuples and dicts of them can be stored."
+        f"{name} is a {type(value).__name__} ({value!r:.60}), which a file without pickles cannot hold. Numbers, texts, "
+        "arrays, and lists, tuples and dicts of them can be stored."
     )
 
 

@@ -532,8 +532,8 @@ class EpisodeBuffer(HerReplayBuffer):
 
         :param path: the file
         :param env: the training environment (for hindsight goals)
-        :param allow_pickle: also read what ``model.save_replay_buffer()`` wrote, or :meth:`save` of earlier versions. **A pickle
-            can execute anything when it is read**: only for files that you trust
+        :param allow_pickle: also read what ``model.save_replay_buffer()`` wrote, or :meth:`save` of earlier versions. **A
+            pickle can execute anything when it is read**: only for files that you trust
         :raises ValueError: if it is damaged, foreign, a pickle, or of a release that this one cannot read
         """
         if holds_pickles(path):
@@ -549,9 +549,9 @@ class EpisodeBuffer(HerReplayBuffer):
     def _unpickled(cls, path: str | Path, allowed: bool) -> Self:
         if not allowed:
             raise ValueError(
-                f"{path} is a pickle, as model.save_replay_buffer() and earlier versions of this package write, and a pickle can "
-                f"execute anything when it is read. If you trust it, {cls.__name__}.load(path, allow_pickle=True) reads it, and "
-                "save() then writes a file that executes nothing."
+                f"{path} is a pickle, as model.save_replay_buffer() and earlier versions of this package write, and a pickle "
+                f"can execute anything when it is read. If you trust it, {cls.__name__}.load(path, allow_pickle=True) reads "
+                "it, and save() then writes a file that executes nothing."
             )
         with Path(path).open("rb") as file:
             try:

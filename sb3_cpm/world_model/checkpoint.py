@@ -3,12 +3,13 @@
 import io
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from sb3_cpm.files import DamagedFileError, first_not_finite, replacing, seal, verify
+from sb3_cpm.files import DamagedFileError, first_not_finite, verify, write_sealed
 
 FILE_FORMAT = "sb3_cpm challenger"
 #: 2: with a digest. 1, which is read as well, had none.
@@ -21,11 +22,7 @@ def write_file(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
     :param content: tensors and plain data
     :raises NotWrittenError: if the disk does not take it; a file that is there already stays as it was
     """
-    file = io.BytesIO()  # what torch says of a disk that is full does not name the disk
-    torch.save({"format": FILE_FORMAT, "version": FILE_VERSION, **content}, file)
-    with replacing(path) as temporary:
-        temporary.write_bytes(file.getbuffer())
-        seal(temporary)
+    write_sealed(path, partial(torch.save, {"format": FILE_FORMAT, "version": FILE_VERSION, **content}))
 
 
 def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
