@@ -218,9 +218,14 @@ class GrowingFile:
         self._pending = b""
         self._size = 0
         self._told = False
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0) | (os.O_EXCL if size is None else 0)
-        with disk_errors_named(path):
-            self._descriptor = os.open(path, flags, 0o666)
+        how = os.O_CREAT | os.O_EXCL if size is None else 0 if size else os.O_CREAT
+        try:
+            with disk_errors_named(path):
+                self._descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0) | how, 0o666)
+        except FileNotFoundError as error:
+            if not size:
+                raise
+            raise DamagedFileError(f"{path} is gone, it had {size} bytes when the checkpoint beside it was made.") from error
         try:
             if size:
                 self._keep(size, digest)
