@@ -4,6 +4,8 @@
 #   ENV=active          use the environment that is active instead of .venv, and install nothing
 #   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest
 #   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
+#   RENDERING=system    where no Vulkan driver is found, install one for the whole machine (needs root) instead of privately;
+#                       RENDERING=private: privately even where there is one
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
@@ -14,11 +16,11 @@ CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
 ifeq ($(ENV),active)
 BIN :=
 READY :=
-RENDERING :=
+PROBED :=
 else
 BIN := $(VENV)/bin/
 READY := $(VENV)/.installed
-RENDERING := $(VENV)/.rendering
+PROBED := $(VENV)/.rendering
 endif
 RUN := $(BIN)python -m
 
@@ -28,14 +30,15 @@ export OMP_NUM_THREADS ?= 1
 help:
 	@echo "make train           set up, train CPM-SAC on PickCube-v1, leave a folder of results in runs/"
 	@echo "make pytest          set up, run all tests"
+	@echo "                     (neither changes the system: RENDERING=system installs a Vulkan driver for the whole machine)"
 	@echo "make doctor          what works here and what is missing"
 	@echo "make type lint format check-codestyle commit-checks"
 	@echo "make venv, make clean-venv"
 
-train: $(READY) $(RENDERING)
+train: $(READY) $(PROBED)
 	$(RUN) sb3_cpm train $(ARGS)
 
-pytest: $(READY) $(RENDERING)
+pytest: $(READY) $(PROBED)
 	$(RUN) pytest $(ARGS)
 
 doctor: $(READY)
@@ -43,7 +46,7 @@ doctor: $(READY)
 
 venv: $(READY)
 
-rendering: $(READY) $(RENDERING)
+rendering: $(READY) $(PROBED)
 
 $(VENV)/bin/python:
 	@echo "==> Making a virtual environment in $(VENV)"
@@ -57,7 +60,7 @@ $(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.rendering: $(VENV)/.installed
 	@echo "==> Looking for a Vulkan device that can render"
-	@$(RUN) sb3_cpm setup-rendering
+	@$(RUN) sb3_cpm setup-rendering $(addprefix --,$(RENDERING))
 	@touch $@
 
 type: $(READY)

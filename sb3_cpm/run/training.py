@@ -367,7 +367,7 @@ def _patient_log(kind: str, folder: Path) -> KVWriter:
                 say(f"{error}. The run goes on; what is logged meanwhile may be missing.")
             told = True
 
-    output.write = attempt  # type: ignore[method-assign]
+    output.write = attempt  # type: ignore[method-assign,assignment]
     return output
 
 
