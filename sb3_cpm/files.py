@@ -339,7 +339,7 @@ def verify(path: str | os.PathLike, what: str = "file") -> bool:
             return True
         try:
             with zipfile.ZipFile(file) as archive:
-                broken = "digest" if len(archive.comment) == _SEAL else archive.testzip()
+                broken = "digest" if _has_place_for_digest(file, size) else archive.testzip()
         except Exception as error:  # of damaged archives zipfile, zlib and struct each complain in their own way
             raise DamagedFileError(
                 f"{path} ({size:,} bytes) is damaged or no saved {what} ({type(error).__name__}: {error}). {_EARLIER}"
@@ -350,6 +350,13 @@ def verify(path: str | os.PathLike, what: str = "file") -> bool:
 
 
 _EARLIER = "Take an earlier one."
+
+
+def _has_place_for_digest(file: Any, size: int) -> bool:
+    """Whether the last record of an archive announces a comment of the length of ours, whatever has become of that."""
+    file.seek(max(0, size - 22 - _SEAL))
+    record = file.read().rpartition(b"PK\5\6")[2]
+    return record[16:18] == _SEAL.to_bytes(2, "little")
 
 
 def _digest(file: Any, size: int) -> bytes:

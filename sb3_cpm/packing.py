@@ -2,13 +2,13 @@
 Python values as JSON and back, exactly: for what pickles would be used for, if they could not execute code.
 
 Numbers, texts, None, lists and dicts are JSON's own. All else is a dict with the key ``"$"``, which says what it is:
-tuples, deques, bytes, arrays and NumPy's scalars, and instances of those dataclasses that the reader names.
+tuples, deques, ordered dicts, bytes, arrays and NumPy's scalars, and instances of those dataclasses that the reader names.
 """
 
 import base64
 import dataclasses
 import io
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Collection
 from typing import Any
 
@@ -29,10 +29,11 @@ def pack(value: Any, classes: Collection[type] = (), name: str = "") -> Any:
         return value
     if type(value) is list:
         return [pack(part, classes, f"{name}[{i}]") for i, part in enumerate(value)]
-    if type(value) is dict:
-        if all(type(key) is str and key != _KIND for key in value):
-            return {key: pack(part, classes, f"{name}[{key!r}]") for key, part in value.items()}
-        return {_KIND: "dict", "items": [pack([key, part], classes, f"{name}[{key!r}]") for key, part in value.items()]}
+    if type(value) is dict and all(type(key) is str and key != _KIND for key in value):
+        return {key: pack(part, classes, f"{name}[{key!r}]") for key, part in value.items()}
+    if type(value) in (dict, OrderedDict):
+        items = [[pack(key, classes, name), pack(part, classes, f"{name}[{key!r}]")] for key, part in value.items()]
+        return {_KIND: type(value).__name__, "items": items}
     if type(value) in (tuple, deque):
         packed = {_KIND: type(value).__name__, "items": pack(list(value), classes, name)}
         return {**packed, "maxlen": value.maxlen} if type(value) is deque else packed
@@ -65,8 +66,8 @@ def unpack(packed: Any, classes: Collection[type] = ()) -> Any:
     kind = packed.get(_KIND)
     if kind is None:
         return {key: unpack(part, classes) for key, part in packed.items()}
-    if kind == "dict":
-        return {key: part for key, part in unpack(packed["items"], classes)}
+    if kind in ("dict", "OrderedDict"):
+        return (dict if kind == "dict" else OrderedDict)(unpack(packed["items"], classes))
     if kind == "tuple":
         return tuple(unpack(packed["items"], classes))
     if kind == "deque":

@@ -207,7 +207,17 @@ def test_a_failed_download_leaves_what_was_there(tmp_path: Path, monkeypatch: py
     fails("could not be downloaded")
     standin_assets.make_egad(tmp_path / EGAD)
     shutil.make_archive(str(archive), "zip", tmp_path, EGAD)
-    assert len(list(assets.download(["PickSingleEGAD-v1"]))) == 1 and names() == whole
+    (line,) = assets.download(["PickSingleEGAD-v1"])
+    assert names() == whole and line.endswith("egad.zip (UNCHECKED: ManiSkill knows no digest of it) ...")
+    # where it knows one, it compares it
+    (folder / "egad_train_set/B1_2.obj").unlink()
+    before = names()
+    monkeypatch.setitem(DATA_SOURCES, "egad", dataclasses.replace(source, checksum="0" * 64))
+    fails("SHA-256 hash does not match")
+    digest = hashlib.sha256(archive.with_suffix(".zip").read_bytes()).hexdigest()
+    monkeypatch.setitem(DATA_SOURCES, "egad", dataclasses.replace(source, checksum=digest))
+    (line,) = assets.download(["PickSingleEGAD-v1"])
+    assert names() == whole and line.endswith("(its SHA-256 is checked) ...")
 
 
 BROKEN = """

@@ -34,9 +34,7 @@ def restored(value: Any, state: Any, name: str = "") -> Any:
     if _has_state(value):
         unknown = sorted({*state} - {*vars(value)}) if type(state) is dict else [repr(state)]
         if unknown:
-            raise ValueError(
-                f"The saved {name or 'state'} has {', '.join(unknown)}, which this version of sb3_cpm does not know."
-            )
+            raise ValueError(f"The saved {name or 'state'} has {', '.join(unknown)}, unknown to this version of sb3_cpm.")
         for key, part in state.items():
             object.__setattr__(value, key, restored(vars(value)[key], part, f"{name}.{key}".lstrip(".")))  # frozen, perhaps
         return value

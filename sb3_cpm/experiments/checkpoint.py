@@ -151,9 +151,10 @@ def restore_buffer(checkpoint: Path, model: BaseAlgorithm) -> None:
 
 def _statistics(normalize: VecNormalize) -> dict[str, RunningMeanStd]:
     """What VecNormalize has counted, by name."""
-    of_observations = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
+    counted = getattr(normalize, "obs_rms", None)  # not there with norm_obs=False
+    of_observations = counted if isinstance(counted, dict) else {"": counted}
     found = {"returns": normalize.ret_rms, **{f"observations {key}": one for key, one in of_observations.items()}}
-    return {name: one for name, one in found.items() if isinstance(one, RunningMeanStd)}  # None where nothing is normalized
+    return {name: one for name, one in found.items() if isinstance(one, RunningMeanStd)}
 
 
 def _numbers(statistics: RunningMeanStd) -> tuple[Any, ...]:
