@@ -156,7 +156,10 @@ def cure() -> str:
 def _open_renderer() -> tuple[Renderer, Any]:
     """:return: the renderer and SAPIEN's render system, which fixes the process's Vulkan device"""
     try:
-        import sapien
+        with warnings.catch_warnings():
+            # it means the system's loader, which a private installation does without
+            warnings.filterwarnings("ignore", "Failed to find system libvulkan", UserWarning)
+            import sapien
     except ImportError as error:  # a shared library is missing
         raise RuntimeError(f"SAPIEN cannot be imported: {error}") from error
     try:
