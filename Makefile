@@ -5,6 +5,8 @@
 #   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest: a file,
 #                       -m "not slow" (a third of the time), -n 0 (everything in one process)
 #   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
+#   RENDERING=system    where no Vulkan driver is found, install one for the whole machine (needs root) instead of privately;
+#                       RENDERING=private: privately even where there is one
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
@@ -16,11 +18,11 @@ CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
 ifeq ($(ENV),active)
 BIN :=
 READY :=
-RENDERING :=
+PROBED :=
 else
 BIN := $(VENV)/bin/
 READY := $(VENV)/.installed
-RENDERING := $(VENV)/.rendering
+PROBED := $(VENV)/.rendering
 endif
 RUN := $(BIN)python -m
 
@@ -31,15 +33,16 @@ help:
 	@echo "make train           set up, train CPM-SAC on PickCube-v1, leave a folder of results in runs/"
 	@echo "make pytest          set up, run all tests"
 	@echo "make sb3-tests       fetch SB3's own tests, which \`make pytest\` runs with our buffer, too, where they are"
+	@echo "                     (neither changes the system: RENDERING=system installs a Vulkan driver for the whole machine)"
 	@echo "make doctor          what works here and what is missing"
 	@echo "make type lint format check-codestyle commit-checks"
 	@echo "make venv, make clean-venv"
 
-train: $(READY) $(RENDERING)
+train: $(READY) $(PROBED)
 	$(RUN) sb3_cpm train $(ARGS)
 
 # Workers share the cores; tests/conftest.py says how many: none for a single file. `-p no:xdist` takes the option away, too.
-pytest: $(READY) $(RENDERING)
+pytest: $(READY) $(PROBED)
 	$(RUN) pytest $(if $(findstring no:xdist,$(ARGS)),,-n auto) $(ARGS)
 
 # They are in SB3's source distribution only. `make pytest` runs those of the version that is installed once they are here.
@@ -56,7 +59,7 @@ doctor: $(READY)
 
 venv: $(READY)
 
-rendering: $(READY) $(RENDERING)
+rendering: $(READY) $(PROBED)
 
 $(VENV)/bin/python:
 	@echo "==> Making a virtual environment in $(VENV)"
@@ -70,7 +73,7 @@ $(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.rendering: $(VENV)/.installed
 	@echo "==> Looking for a Vulkan device that can render"
-	@$(RUN) sb3_cpm setup-rendering
+	@$(RUN) sb3_cpm setup-rendering $(addprefix --,$(RENDERING))
 	@touch $@
 
 type: $(READY)

@@ -5,7 +5,6 @@ complete, means with 95% confidence intervals over seeds.
 
 import csv
 import itertools
-import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cpm.files import replacing
 from sb3_cpm.run.evaluation import FIRST_SEED
 
 
@@ -68,13 +68,10 @@ class Table:
         self.rows.append(row)
 
     def complete(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = self.path.with_suffix(".tmp")
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
+        with replacing(self.path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(self.rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows)
-        os.replace(unfinished, self.path)
 
 
 def missing(

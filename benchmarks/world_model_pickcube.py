@@ -35,7 +35,7 @@ from gymnasium import spaces
 
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.run.folder import atomic
+from sb3_cpm.files import replacing
 from sb3_cpm.run.plots import BLUE, GREY, ORANGE, STYLE, save_figure
 from sb3_cpm.type_aliases import SequenceBatch
 
@@ -115,7 +115,7 @@ def save_recorded(path: Path, episodes: list[Recorded]) -> None:
     """As arrays of shape ``(n_episodes, ...)``."""
     arrays = {key: np.stack([one.observations[key] for one in episodes]) for key in KEYS}
     others = {name: np.stack([getattr(one, name) for one in episodes]) for name in ("actions", "rewards")}
-    with atomic(path) as temporary, temporary.open("wb") as file:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays, **others)
 
 

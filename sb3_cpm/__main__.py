@@ -46,6 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    except OSError as error:
+        from sb3_cpm.files import NotWrittenError
+
+        if not isinstance(error, NotWrittenError):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -112,10 +119,17 @@ def make_parser() -> argparse.ArgumentParser:
     rendering = commands.add_parser(
         "setup-rendering",
         help="find a Vulkan device that can render, or install software Vulkan",
-        description="Find a Vulkan device that ManiSkill can render with; where there is none, install software Vulkan: for "
-        "the system as root, privately otherwise. Can be repeated.",
+        description="Find a Vulkan device that ManiSkill can render with; where there is none, install software Vulkan into "
+        "a folder of this user's, or for the whole machine. Can be repeated.",
     )
-    rendering.add_argument("--private", action="store_true", help="install privately even as root")
+    where = rendering.add_mutually_exclusive_group()
+    where.add_argument("--private", action="store_true", help="install privately even where the machine's own driver works")
+    where.add_argument(
+        "--system",
+        action="store_true",
+        help="install for the whole machine, as root: packages with apt and, on Debian 12, its backports suite as a new "
+        "source of packages in /etc/apt/sources.list.d",
+    )
     rendering.set_defaults(command=_setup_rendering)
 
     assets = commands.add_parser(
@@ -216,10 +230,10 @@ def _doctor() -> int:
     return run_doctor()
 
 
-def _setup_rendering(private: bool) -> int:
+def _setup_rendering(private: bool, system: bool) -> int:
     from sb3_cpm.envs.rendering import setup_rendering
 
-    return setup_rendering(private=private)
+    return setup_rendering(private=private, system=system)
 
 
 def _assets(env_ids: list[str], download: bool) -> int:

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_cpm.arguments import check_arguments, check_names, nearest
+from sb3_cpm.files import check_finite
 from sb3_cpm.presets import make_preset, plain
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions, Uncertainty
@@ -25,7 +26,7 @@ from sb3_cpm.uncertainty.base import LatentSizes
 from sb3_cpm.uncertainty.ensemble import Ensemble
 from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imagination
-from sb3_cpm.world_model.checkpoint import check_finite, check_sizes, check_storable, read_file, write_file
+from sb3_cpm.world_model.checkpoint import check_sizes, check_storable, read_file, state_to_check, write_file
 from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
 from sb3_cpm.world_model.linear import frozen
 from sb3_cpm.world_model.networks import MLP
@@ -500,10 +501,11 @@ class Challenger:
         :param path: of the file
         :param include_rng: also torch's global random state
         :raises RuntimeError: if a weight is not finite; the last good file is kept then
+        :raises OSError: if the disk does not take it; the last good file is kept then, too
         """
-        for name, network in self.networks.items():
-            check_finite(path, name, network.state_dict())
-        write_file(path, {"config": self._config(), "state": self.state_dict(include_rng)})
+        state = self.state_dict(include_rng)
+        check_finite(path, "challenger", state_to_check(state))
+        write_file(path, {"config": self._config(), "state": state})
 
     def load_state(self, path: str | os.PathLike, restore_rng: bool = False) -> None:
         """
@@ -512,7 +514,8 @@ class Challenger:
 
         :param path: of the file
         :param restore_rng: also set torch's global random state
-        :raises ValueError: for damaged or foreign files, and for challengers of other keys or sizes; nothing is changed then
+        :raises ValueError: for damaged or foreign files, for weights that are not finite, and for challengers of other keys or
+            sizes; nothing is changed then
         """
         content = read_file(path, self.device)
         theirs, ours = content["config"]["keys"], self._config()["keys"]
@@ -561,7 +564,7 @@ class Challenger:
         :param device: may be another one than it was saved from
         :param uncertainty_class: needed where it was built with a class of your own
         :param restore_rng: also set torch's global random state
-        :raises ValueError: for files that are damaged or something else
+        :raises ValueError: for files that are damaged or something else, and for weights that are not finite
         """
         target = choose_device(device)
         content = read_file(path, target)

@@ -153,6 +153,11 @@ def _rendering(torch_works: bool) -> Iterator[Finding]:
         return
     from sb3_cpm.envs import rendering, vulkan
 
+    try:
+        vulkan.cache_folder()
+    except RuntimeError as error:
+        yield Finding("cache folder", False, *str(error).rsplit(". ", 1))
+        return
     probe = rendering.probe_renderer()
     if probe.renderer is None:
         yield Finding("SAPIEN renders", False, probe.problem, rendering.cure())

@@ -15,7 +15,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import set_random_seed
 
+from sb3_cpm.envs import vulkan
+
 th.set_num_threads(1)
+vulkan.activate_private()  # SAPIEN's and OpenCV's libraries, where there is a private installation: tests import them directly
 
 #: Files of more than 30 CPU seconds, the longest first: begun at the end, one of them would keep a single core busy alone.
 LONGEST = (

@@ -18,6 +18,7 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cpm.buffers import CPMBuffer, Demonstration, allocation
+from sb3_cpm.files import write_archive
 from sb3_cpm.type_aliases import Evaluation
 
 SPACE = spaces.Dict(
@@ -257,25 +258,59 @@ def test_no_folder_to_write_to(tmp_path):
 # ---------------------------------------------------------------------- saving and loading
 
 
-@pytest.mark.parametrize("how", ["truncated", "empty", "foreign", "text", "format"])
-def test_what_cannot_be_loaded(how, tmp_path):
-    path = tmp_path / "buffer.pkl"
+@pytest.mark.parametrize(
+    "how, message",
+    [
+        ("truncated", "is damaged or no saved replay buffer"),
+        ("empty", "is damaged or no saved replay buffer"),
+        ("text", "is damaged or no saved replay buffer"),
+        ("archive", "is no saved replay buffer: it has no digest"),
+        ("other", "is no saved replay buffer"),
+        ("version", "has version 2, this version of sb3_cpm reads version 3"),
+        ("kind", "holds a EpisodeBuffer, not a CPMBuffer"),
+        ("pickle", "is a pickle.*can execute anything.*allow_pickle=True"),
+        ("missing", "There is no file"),
+    ],
+)
+def test_what_cannot_be_loaded(how, message, tmp_path):
+    path = tmp_path / "buffer.npz"
     buffer = make()
     fill(buffer, [5])
     buffer.save(path)
     whole = path.read_bytes()
-    if how == "foreign":
-        path.write_bytes(pickle.dumps({"not": "a buffer"}))
-    elif how == "format":
-        path.write_bytes(whole.replace(b"format", b"formax"))
+    content, arrays = buffer._state()
+    content = {"kind": "CPMBuffer", "version": 3, **content}
+    if how == "archive":
+        np.savez(path, **arrays)
+    elif how in ("other", "version", "kind"):
+        changed = {"other": {"a": 1}, "version": {**content, "version": 2}, "kind": {**content, "kind": "EpisodeBuffer"}}
+        write_archive(path, changed[how], arrays)
+    elif how == "missing":
+        path.unlink()
     else:
-        path.write_bytes({"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"hello"}[how])
-    message = "holds a dict" if how == "foreign" else "reads format 2" if how == "format" else "not a complete saved CPMBuffer"
+        texts = {"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"hello", "pickle": pickle.dumps(buffer)}
+        path.write_bytes(texts[how])
     with pytest.raises(ValueError, match=message):
         CPMBuffer.load(path)
     path.write_bytes(whole)
     assert CPMBuffer.load(path).episodes == buffer.episodes
-    assert [file.name for file in tmp_path.iterdir()] == ["buffer.pkl"]
+    assert [file.name for file in tmp_path.iterdir()] == ["buffer.npz"]
+
+
+def test_a_pickle_is_read_by_who_trusts_it(tmp_path):
+    path = tmp_path / "buffer.pkl"
+    buffer = make()
+    fill(buffer, [5])
+    path.write_bytes(pickle.dumps(buffer))
+    assert CPMBuffer.load(path, allow_pickle=True).episodes == buffer.episodes
+    for content, message in (
+        (pickle.dumps({"not": "a buffer"}), "holds a dict, not a CPMBuffer"),
+        (pickle.dumps(buffer)[:-100], "not a complete saved CPMBuffer"),
+        (pickle.dumps(buffer).replace(b"format", b"formax"), "reads format 2"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            CPMBuffer.load(path, allow_pickle=True)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # SB3 doesn't close the file then

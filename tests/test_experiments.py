@@ -26,10 +26,11 @@ from sb3_cpm.experiments.evaluation import evaluate
 from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES, write_title
 from sb3_cpm.experiments.grid import attempt, perform_all
 from sb3_cpm.experiments.player_losses import player_losses
-from sb3_cpm.experiments.run_folder import LockedError, description, locked
+from sb3_cpm.experiments.run_folder import description
 from sb3_cpm.experiments.single_run import Watcher, perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
+from sb3_cpm.files import LockedError, locked
 from sb3_cpm.run.evaluation import FIRST_SEED
 from sb3_cpm.zoo.agents import load_agent
 
@@ -285,7 +286,7 @@ def test_another_version_is_mentioned(tmp_path):
 def test_two_runs_never_write_one_folder(tmp_path):
     spec = make_spec(steps=80)
     code = (
-        "import sys, time, pathlib\nfrom sb3_cpm.experiments.run_folder import locked\n"
+        "import sys, time, pathlib\nfrom sb3_cpm.files import locked\n"
         "with locked(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     )
     folder = spec.folder(tmp_path)
@@ -525,7 +526,7 @@ def test_crashed_runs_are_not_just_unfinished(tmp_path, tiny_experiment, monkeyp
     ]
 
 
-@pytest.mark.parametrize("damage", ["shorter", "gone", "settings", "state"])
+@pytest.mark.parametrize("damage", ["shorter", "edited", "gone", "settings", "state", "model", "pickles"])
 def test_a_damaged_unfinished_run_does_not_go_on(tmp_path, monkeypatch, damage):
     spec = make_spec()
     unbroken = kill_at(monkeypatch, 190)
@@ -537,14 +538,24 @@ def test_a_damaged_unfinished_run_does_not_go_on(tmp_path, monkeypatch, damage):
     if damage == "shorter":
         cut("evaluations.csv", 0, 2)(folder)
     elif damage == "state":
-        overwrite("checkpoint/state.pkl", lambda content: content[:-20])(folder)
+        overwrite("checkpoint/state.npz", lambda content: content[:-20])(folder)
+    elif damage == "edited":
+        overwrite("training.csv", lambda text: text.replace(b"50", b"51", 1))(folder)
+    elif damage == "model":
+        overwrite("checkpoint/model.zip", lambda content: content[:1000] + b"x" + content[1001:])(folder)
+    elif damage == "pickles":
+        (folder / "checkpoint/state.npz").rename(folder / "checkpoint/state.pkl")
     else:
         (folder / {"gone": "evaluations.csv", "settings": "config.yml"}[damage]).unlink()
     again = attempt(spec, tmp_path, lambda line: None)
-    assert again.outcome == ("refused" if damage == "settings" else "crashed")
+    assert again.outcome == "refused"
     assert str(folder) in again.message and "emove" in again.message
+    assert ("earlier sb3_cpm, as pickles" in again.message) == (damage == "pickles")
     left = csv_files(folder)
+    if damage == "edited":
+        tables.pop("training.csv"), left.pop("training.csv")
     assert all(tables[name].startswith(text) for name, text in left.items()), "nothing was added or overwritten"
+    assert len(left) == len(tables) - (damage == "gone") and not (folder / "crashed.txt").exists()
     assert not (folder / "finished.yml").exists()
 
 

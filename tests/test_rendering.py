@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sb3_cpm.__main__ import main
 from sb3_cpm.envs import rendering, vulkan, vulkan_install
 
 NOWHERE = {"VK_DRIVER_FILES": "/nonexistent.json", "VK_ICD_FILENAMES": "/nonexistent.json"}
@@ -98,6 +99,77 @@ def test_cache_folder_falls_back_to_the_temporary_folder(monkeypatch: pytest.Mon
     monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert vulkan.cache_folder() == tmp_path / f"sb3_cpm-{os.getuid()}"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_what_others_could_have_planted_is_not_trusted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Native libraries are loaded from this folder, and its name in the temporary folder can be guessed."""
+    blocked = tmp_path / "file"
+    blocked.touch()
+    monkeypatch.delenv("SB3_CPM_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    guessed = tmp_path / f"sb3_cpm-{os.geteuid()}"
+    assert vulkan.cache_folder() == guessed and guessed.stat().st_mode & 0o777 == 0o700
+    os.chown(guessed, 12345, 12345)
+    with pytest.raises(RuntimeError, match=r"no folder to keep libraries in: .* belongs to another user \(number 12345\)"):
+        vulkan.cache_folder()
+    guessed.rename(tmp_path / "theirs")
+    (tmp_path / "ours").mkdir()
+    guessed.symlink_to(tmp_path / "ours")
+    os.chown(guessed, 12345, 12345, follow_symlinks=False)
+    with pytest.raises(RuntimeError, match="belongs to another user"):  # a link of theirs to a folder of ours
+        vulkan.cache_folder()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    folder = vulkan.cache_folder()
+    assert folder == tmp_path / "home/sb3_cpm", "another one will do"
+    folder.chmod(0o775)  # made with a umask of 002
+    assert vulkan.cache_folder() == folder and folder.stat().st_mode & 0o777 == 0o755
+    for mode in (0o777, 0o1777):
+        folder.chmod(mode)
+        with pytest.raises(RuntimeError, match="can be written by others"):
+            vulkan.cache_folder()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("planted", ["", "vulkan", "vulkan/icd.json", "vulkan/root/usr/lib/x86_64-linux-gnu/libplanted.so"])
+def test_a_planted_library_is_not_loaded(planted: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    library = tmp_path / "vulkan/root/usr/lib/x86_64-linux-gnu/libplanted.so"
+    library.parent.mkdir(parents=True)
+    library.touch()
+    (tmp_path / "vulkan/icd.json").write_text("{}")
+    monkeypatch.setenv("SB3_CPM_CACHE", str(tmp_path))
+    for name in vulkan.DRIVER_VARIABLES:
+        monkeypatch.setenv(name, "")  # and taken away again, what activation sets
+    loaded: list[Path] = []
+    monkeypatch.setattr(vulkan, "_loads", lambda path: loaded.append(path) or True)
+    assert vulkan.activate_private() and loaded == [library]
+    loaded.clear()
+    os.chown(tmp_path / planted, 12345, 12345)
+    with pytest.raises(RuntimeError, match="belongs to another user .*12345.*(native libraries are loaded|is not loaded)"):
+        vulkan.activate_private()
+    assert not loaded
+    os.chown(tmp_path / planted, 0, 0)
+    (tmp_path / planted).chmod(0o777)
+    with pytest.raises(RuntimeError, match="can be written by others"):
+        vulkan.activate_private()
+    assert not loaded
+
+
+def test_the_system_is_only_changed_on_demand(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nobody is asked either: a batch job would wait for ever."""
+    installed: list[str] = []
+    broken = rendering.Probe(None, "", "no driver", 0.0)
+    monkeypatch.setattr(rendering, "probe_renderer", lambda **_: broken)
+    monkeypatch.setattr(vulkan, "named_drivers", lambda: "")
+    monkeypatch.setattr(vulkan_install, "install_private", lambda say: installed.append("private"))
+    monkeypatch.setattr(vulkan_install, "install_system", lambda say: installed.append("system"))
+    for uid in (0, 1000):
+        monkeypatch.setattr(os, "geteuid", lambda uid=uid: uid)
+        for options in ([], ["--private"], ["--system"]):
+            main(["setup-rendering", *options])
+    assert installed == ["private", "private", "system", "private", "private"]
+    assert "needs root: run it as root, or leave --system out" in capsys.readouterr().err
 
 
 def test_publish_keeps_what_is_there(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run import environment as environments
 from sb3_cpm.run.environment import make_env
 from sb3_cpm.run.evaluation import FIRST_SEED, play_episode
-from sb3_cpm.run.folder import atomic, make_run_folder
+from sb3_cpm.run.folder import RunFolder
 from sb3_cpm.run.plots import read_csv, running_mean
 from sb3_cpm.run.recorder import CSVTable
 from sb3_cpm.run.summary import Summary, complete_times
@@ -76,7 +76,7 @@ def check_pictures(folder: Path) -> None:
 
 def load_model(folder: Path) -> SAC:
     model = SAC.load(folder / "model.zip", env=gym.make("CPMToy-v0"), device="cpu")
-    model.load_replay_buffer(folder / "replay_buffer.pkl", truncate_last_traj=False)
+    model.replay_buffer = CPMBuffer.load(folder / "replay_buffer.npz", env=model.get_env())
     return model
 
 
@@ -166,7 +166,7 @@ def test_never_overwrites(finished: tuple[Path, Summary], monkeypatch: pytest.Mo
     with pytest.raises(ValueError, match="not empty"):
         train(run_folder=str(folder), **SMALL)
     monkeypatch.chdir(tmp_path)
-    names = [make_run_folder(TrainSettings(env="CPMToy-v0")).name for _ in range(3)]
+    names = [RunFolder(TrainSettings(env="CPMToy-v0")).path.name for _ in range(3)]
     assert names == ["CPMToy-v0-sac-seed0", "CPMToy-v0-sac-seed0-2", "CPMToy-v0-sac-seed0-3"]
 
 
@@ -352,16 +352,6 @@ class SeededReset(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return self.env.reset(seed=self.seed, options=options)
-
-
-def test_atomic_files(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), atomic(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_csv_table_is_complete_after_every_row(tmp_path: Path) -> None:

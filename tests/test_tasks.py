@@ -4,6 +4,7 @@ states on a machine that cannot draw.
 """
 
 import dataclasses
+import hashlib
 import os
 import shutil
 import subprocess
@@ -166,7 +167,7 @@ def test_unusual_ends_of_whole_files(tmp_path: Path, text: str) -> None:
 def test_a_failed_download_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from mani_skill.utils.assets import DATA_SOURCES
 
-    assets.assets_of("PickSingleEGAD-v1")  # makes the task known
+    list(assets.report(["PickSingleEGAD-v1"]))  # makes the task known
     standin_assets.make_all(tmp_path / "assets")
     data, archive = tmp_path / "assets/data", tmp_path / "egad"
     folder = data / EGAD
@@ -207,7 +208,19 @@ def test_a_failed_download_leaves_what_was_there(tmp_path: Path, monkeypatch: py
     fails("could not be downloaded")
     standin_assets.make_egad(tmp_path / EGAD)
     shutil.make_archive(str(archive), "zip", tmp_path, EGAD)
-    assert len(list(assets.download(["PickSingleEGAD-v1"]))) == 1 and names() == whole
+    content = archive.with_suffix(".zip").read_bytes()
+    (line,) = assets.download(["PickSingleEGAD-v1"])
+    assert names() == whole and line.endswith("egad.zip (UNCHECKED: ManiSkill knows no digest of it) ...")
+    # where it knows one, it compares it
+    (folder / "egad_train_set/B1_2.obj").unlink()
+    before = names()
+    for digest in ("0" * 64, hashlib.sha256(content).hexdigest()):
+        archive.with_suffix(".zip").write_bytes(content)  # ManiSkill removes what it has unpacked
+        monkeypatch.setitem(DATA_SOURCES, "egad", dataclasses.replace(source, checksum=digest))
+        if digest == "0" * 64:
+            fails("SHA-256 hash does not match")
+    (line,) = assets.download(["PickSingleEGAD-v1"])
+    assert names() == whole and line.endswith("(its SHA-256 is checked) ...")
 
 
 BROKEN = """

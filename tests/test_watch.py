@@ -176,10 +176,13 @@ def test_what_cannot_be_watched(finished: Path, tmp_path: Path, capsys: pytest.C
     with pytest.raises(ValueError, match=r"has no challenger\.pt"):
         watch(incomplete)
     shutil.copy(finished / "challenger.pt", incomplete)
-    with pytest.raises(ValueError, match=r"has no replay_buffer\.pkl"):
+    with pytest.raises(ValueError, match=r"has no replay_buffer\.npz"):
         watch(incomplete)
     (incomplete / "replay_buffer.pkl").write_bytes(b"broken")
-    with pytest.raises(ValueError, match="replay_buffer"):
+    with pytest.raises(ValueError, match="of an earlier version, which pickled its replay buffer.*allow_pickle=True"):
+        watch(incomplete)
+    (incomplete / "replay_buffer.npz").write_bytes(b"broken")
+    with pytest.raises(ValueError, match=r"replay_buffer\.npz .* is damaged"):
         watch(incomplete)
     for arguments in ({"frames": 65}, {"context": 0}, {"context": 50}, {"frames": 3}):
         with pytest.raises(ValueError, match="expected 1 <= context < frames <= 64"):

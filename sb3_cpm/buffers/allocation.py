@@ -9,6 +9,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class InFolder:
         n_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         if n_bytes == 0:
             return np.zeros(shape, dtype=dtype)
-        path = self.folder / f"{name}.{self._n_files}"
+        path = self.folder / f"{quote(name, '')}.{self._n_files}"  # keys of observations may hold slashes
         self._n_files += 1
         try:
             _reserve(path, n_bytes)

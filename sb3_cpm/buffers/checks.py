@@ -123,10 +123,21 @@ def _layout(space: spaces.Space) -> Any:
     return {key: (part.shape, str(part.dtype)) for key, part in space.spaces.items()}
 
 
+def holds_pickles(path: str | Path) -> bool:
+    """
+    :param path: of a file, perhaps
+    :return: whether it begins as pickles do; our own files are zip archives
+    """
+    if not Path(path).is_file():
+        return False
+    with Path(path).open("rb") as file:
+        return file.read(1) == b"\x80"  # pickle's protocols 2 to 5
+
+
 def unreadable(path: str | Path, error: Exception) -> ValueError:
     """What to say of a file that pickle cannot read."""
     size = Path(path).stat().st_size
     return ValueError(
         f"{path} ({size:,} bytes) is not a complete saved CPMBuffer: {error or type(error).__name__}. It may have been "
-        "cut off while it was written (CPMBuffer.save never leaves half a file); take an earlier one."
+        "cut off while it was written; take an earlier one. (CPMBuffer.save never leaves half a file.)"
     )

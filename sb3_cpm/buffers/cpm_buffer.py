@@ -20,16 +20,22 @@ from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from sb3_cpm.buffers.checks import check_arguments, check_shares
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
-from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
+from sb3_cpm.buffers.episode_buffer import NOT_SAVED, EpisodeBuffer
 from sb3_cpm.buffers.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
 from sb3_cpm.buffers.sequences import side_by_side
 from sb3_cpm.buffers.storage import Episode
-from sb3_cpm.challenges import ChallengeCurator, OriginKind, Proposal
+from sb3_cpm.challenges import ArtificialRewards, ChallengeCurator, OriginKind, Proposal
+from sb3_cpm.challenges.state import restored, state_of
+from sb3_cpm.files import Archive
+from sb3_cpm.packing import pack, unpack
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 
 #: Key of ``infos[i]`` under which the exploration wrapper tells the action, within [-1, 1], that was really executed.
 EXECUTED_ACTION = "cpm_executed_action"
+
+#: What the file of a buffer may hold of I.
+_OF_CHALLENGES = (Challenge, Episode, Proposal, ArtificialRewards)
 
 
 class CPMBuffer(EpisodeBuffer):
@@ -109,6 +115,7 @@ class CPMBuffer(EpisodeBuffer):
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
     ):
+        given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_arguments(
             observation_space, action_space, challenge_ratio, demonstration_ratio, mix, max_challenges, refresh_every
         )
@@ -128,6 +135,7 @@ class CPMBuffer(EpisodeBuffer):
             memmap_dir=memmap_dir,
             player_keys=player_keys,
         )
+        self._given = given
         self.challenge_ratio = challenge_ratio
         self.demonstration_ratio = demonstration_ratio
         self.mix = mix
@@ -412,6 +420,27 @@ class CPMBuffer(EpisodeBuffer):
         super().set_env(env)
         if self.demonstrations is not None:
             self.demonstrations.env = env
+
+    def _state(self, prefix: str = "") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        content, arrays = super()._state(prefix)
+        content["curator"] = pack(state_of(self.curator), name="curator")
+        content["counters"] = pack(self.counters, (ChallengeCounters,))
+        content["completed"] = pack(self._completed, (Episode,))
+        content["imaginary"] = pack(self._imaginary.state(), _OF_CHALLENGES, "challenges")
+        if self.demonstrations is not None:
+            content["demonstrations"], theirs = self.demonstrations._state(f"{prefix}demonstrations/")
+            arrays |= theirs
+        return content, arrays
+
+    def _restore(self, content: dict[str, Any], archive: Archive, prefix: str) -> None:
+        super()._restore(content, archive, prefix)
+        restored(self.curator, unpack(content["curator"]), "curator")
+        self.counters = unpack(content["counters"], (ChallengeCounters,))
+        self._completed = unpack(content["completed"], (Episode,))
+        self._imaginary.restore(unpack(content["imaginary"], _OF_CHALLENGES))
+        if "demonstrations" in content:
+            theirs = content["demonstrations"]
+            self.demonstrations = EpisodeBuffer._made_from(theirs, archive, f"{prefix}demonstrations/")
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()

@@ -12,7 +12,7 @@ transitions of complete episodes, u of unfinished ones::
 """
 
 import copy
-import os
+import inspect
 import pickle
 import warnings
 from collections import deque
@@ -30,15 +30,20 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
 from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
-from sb3_cpm.buffers.checks import check_environment, check_spaces, checked_rewards, unreadable
+from sb3_cpm.buffers.checks import check_environment, check_spaces, checked_rewards, holds_pickles, unreadable
 from sb3_cpm.buffers.compact import StorageSpec, make_codecs
+from sb3_cpm.buffers.saving import pack_space, unpack_space
 from sb3_cpm.buffers.sequences import draw_starts, read_sequences
 from sb3_cpm.buffers.storage import Episode, NextObservationView, ObservationRing, Transitions
+from sb3_cpm.files import Archive, DamagedFileError, write_archive
+from sb3_cpm.packing import pack, unpack
 from sb3_cpm.type_aliases import SequenceBatch
 
-#: Changes whenever a pickled buffer of an earlier release could be misread.
-FORMAT = 2
+#: Changes whenever a buffer of an earlier release could be misread: of one that was pickled, and of one in a file of ours.
+FORMAT, FILE_FORMAT = 2, 3
 _VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+#: Arguments that belong to where a buffer is used, and what else ``locals()`` has
+NOT_SAVED = ("self", "__class__", "env", "device")
 # Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
 _BOOKS = 3 * 4 + 2 * 8 + 4
 
@@ -81,6 +86,7 @@ class EpisodeBuffer(HerReplayBuffer):
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
     ):
+        self._given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_spaces(observation_space, n_sampled_goal, player_keys)
         # The parent allocates two copies of the observations and a dict per transition: give it a single slot.
         super().__init__(
@@ -509,28 +515,44 @@ class EpisodeBuffer(HerReplayBuffer):
 
     def save(self, path: str | Path) -> None:
         """
-        Save everything, as ``model.save_replay_buffer(path)`` does, but never leave half a file.
+        Save everything in one file of arrays and JSON, which cannot execute anything when it is read, unlike the pickle that
+        ``model.save_replay_buffer()`` makes. It is replaced only by a complete one.
 
-        :param path: file to write, replaced only once it is complete
+        :param path: file to write, ``"replay_buffer.npz"`` for instance
+        :raises ValueError: if something is no plain data: a space of one's own, objects in infos (with ``copy_info_dict``)
+        :raises NotWrittenError: if the disk does not take it, naming the file
         """
-        path = Path(path)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as file:
-                pickle.dump(self, file, protocol=pickle.HIGHEST_PROTOCOL)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        content, arrays = self._state()
+        write_archive(path, {"kind": type(self).__name__, "version": FILE_FORMAT, **content}, arrays)
 
     @classmethod
-    def load(cls, path: str | Path, env: VecEnv | None = None) -> Self:
+    def load(cls, path: str | Path, env: VecEnv | None = None, allow_pickle: bool = False) -> Self:
         """
-        Load what :meth:`save` or ``model.save_replay_buffer()`` saved.
+        Load what :meth:`save` saved.
 
         :param path: the file
         :param env: the training environment (for hindsight goals)
-        :raises ValueError: if it is truncated, foreign, or of a release that this one cannot read
+        :param allow_pickle: also read what ``model.save_replay_buffer()`` wrote, or :meth:`save` of earlier versions. **A
+            pickle can execute anything when it is read**: only for files that you trust
+        :raises ValueError: if it is damaged, foreign, a pickle, or of a release that this one cannot read
         """
+        if holds_pickles(path):
+            buffer = cls._unpickled(path, allow_pickle)
+        else:
+            with Archive(path, "replay buffer") as archive:
+                buffer = cls._from(archive)
+        if env is not None:
+            buffer.set_env(env)
+        return buffer
+
+    @classmethod
+    def _unpickled(cls, path: str | Path, allowed: bool) -> Self:
+        if not allowed:
+            raise ValueError(
+                f"{path} is a pickle, as model.save_replay_buffer() and earlier versions of this package write, and a pickle "
+                f"can execute anything when it is read. If you trust it, {cls.__name__}.load(path, allow_pickle=True) reads "
+                "it, and save() then writes a file that executes nothing."
+            )
         with Path(path).open("rb") as file:
             try:
                 buffer = pickle.load(file)
@@ -538,9 +560,98 @@ class EpisodeBuffer(HerReplayBuffer):
                 raise unreadable(path, error) from error
         if not isinstance(buffer, cls):
             raise ValueError(f"{path} holds a {type(buffer).__name__}, not a {cls.__name__}")
-        if env is not None:
-            buffer.set_env(env)
         return buffer
+
+    @classmethod
+    def _from(cls, archive: Archive) -> Self:
+        content, path = archive.content, archive.path
+        if not isinstance(content, dict) or not {"kind", "version", "arguments"} <= set(content):
+            raise DamagedFileError(f"{path} is no saved replay buffer.")
+        if content["version"] != FILE_FORMAT:
+            raise ValueError(f"{path} has version {content['version']}, this version of sb3_cpm reads version {FILE_FORMAT}.")
+        if content["kind"] != cls.__name__:
+            raise ValueError(f"{path} holds a {content['kind']}, not a {cls.__name__}")
+        return cls._made_from(content, archive, "")
+
+    @classmethod
+    def _made_from(cls, content: dict[str, Any], archive: Archive, prefix: str) -> Self:
+        arguments = {name: unpack(value) for name, value in content["arguments"].items()}
+        for name, space in content["spaces"].items():
+            arguments[name] = unpack_space(space)
+        device = content["device"] if th.device(content["device"]).type == "cpu" or th.cuda.is_available() else "cpu"
+        buffer = cls(**arguments, device=device)
+        buffer._restore(content, archive, prefix)
+        return buffer
+
+    def _arguments(self) -> dict[str, Any]:
+        """What the constructor must be given for a buffer like this one, as it is now."""
+        given: dict[str, Any] = getattr(self, "_given", {})  # buffers that earlier versions pickled have none
+        names = given or [name for name in inspect.signature(type(self)).parameters if hasattr(self, name)]
+        # what can be changed later is an attribute of the same name
+        found = {name: getattr(self, name, given.get(name)) for name in names if name not in NOT_SAVED}
+        found["buffer_size"] = max(given.get("buffer_size", 0), self.buffer_size * self.n_envs)
+        found["goal_selection_strategy"] = self.goal_selection_strategy.name.lower()
+        found["memmap_dir"] = None if self.memmap_dir is None else str(self.memmap_dir)
+        return found
+
+    def _state(self, prefix: str = "") -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """
+        Everything that it holds. A subclass with a state of its own adds to both.
+
+        :param prefix: before the names of the arrays
+        :return: what JSON can say, and arrays
+        """
+        arguments = self._arguments()
+        found = {name: arguments.pop(name) for name in ("observation_space", "action_space")}
+        used = self.buffer_size if self.full else self.pos  # the rest is as it was allocated
+        content = {
+            "arguments": {name: pack(value, name=name) for name, value in arguments.items()},
+            "spaces": {name: pack_space(space, name) for name, space in found.items()},
+            "device": str(self.device),
+            "pos": self.pos,
+            "full": bool(self.full),
+            "n_steps": self._n_steps,
+            "episodes": pack([episode for episodes in self._episodes for episode in episodes], (Episode,)),
+            "starts": [[slot, envs] for slot, envs in self._starts.items()],
+            "infos": pack(self.infos[:used].tolist(), name="infos"),
+            "ring": pack(self.ring.books()),
+        }
+        arrays = {
+            "actions": self.actions[:used],
+            "outcomes": self._outcomes[:used],
+            "current_ep_start": self._current_ep_start,
+            "n_episodes": self._n_episodes,
+            "n_valid": self._n_valid,
+            "began": self._began,
+            **self.ring.arrays(used),
+        }
+        return content, {f"{prefix}{name}": array for name, array in arrays.items()}
+
+    def _restore(self, content: dict[str, Any], archive: Archive, prefix: str) -> None:
+        """
+        The opposite of :meth:`_state`, for a buffer that the same arguments have made and that is empty.
+
+        :raises ValueError: if the state does not belong to such a buffer
+        """
+        self.pos, self.full, self._n_steps = content["pos"], content["full"], content["n_steps"]
+        used = self.buffer_size if self.full else self.pos
+        self.ring.restore_books(unpack(content["ring"]))
+        archive.read_into(f"{prefix}actions", self.actions[:used])
+        archive.read_into(f"{prefix}outcomes", self._outcomes[:used])
+        for name, array in self.ring.arrays(used).items():
+            archive.read_into(f"{prefix}{name}", array)
+        self._current_ep_start, self._n_episodes, self._n_valid, self._began = (
+            archive.array(f"{prefix}{name}") for name in ("current_ep_start", "n_episodes", "n_valid", "began")
+        )
+        self._valid_ends = np.cumsum(self._n_valid)
+        self._earliest_began = int(self._began.min())
+        for episode in unpack(content["episodes"], (Episode,)):
+            self._episodes[episode.env_idx].append(episode)
+        self._starts = {slot: envs for slot, envs in content["starts"]}
+        infos = unpack(content["infos"])
+        for row in range(len(infos)):
+            for env_idx in range(self.n_envs):  # one by one: NumPy would take dicts apart
+                self.infos[row, env_idx] = infos[row][env_idx]
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()

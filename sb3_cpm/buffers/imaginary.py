@@ -5,13 +5,17 @@ A challenge holds positions in D, rewards of its own and what it was chosen for,
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from sb3_cpm.buffers.storage import Episode
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
+
+#: Attributes of I that come from the buffer's arguments or are made when they are needed.
+_GIVEN = {"buffer_size", "max_challenges", "_index"}
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,16 @@ class ImaginaryBuffer:
         self._age_sum += now - float(index.rewarded_at.take(picks).mean())
         self._age_samples += 1
         return index.slots.take(picks), index.envs.take(picks), index.rewards.take(picks), index.is_goal.take(picks)
+
+    def state(self) -> dict[str, Any]:
+        """All that it holds, for :meth:`restore`."""
+        return {name: value for name, value in vars(self).items() if name not in _GIVEN}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """:param state: of an imaginary buffer beside a D of the same size"""
+        for name in vars(self).keys() - _GIVEN:
+            setattr(self, name, state[name])
+        self._index = None
 
     def pop_sampled_age(self) -> float | None:
         """:return: mean age of the rewards sampled since the last call, in transitions; None if there were none"""

@@ -16,6 +16,7 @@ then it waits beside the ring. An example of four slots::
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 
@@ -89,12 +90,16 @@ class FinalObservations:
             return
         used = len(next(iter(self.arrays.values())))
         grown = used + max(16, n, used // 4)
+        self.resize(grown)
+        self._free.extend(range(grown - 1, used - 1, -1))
+
+    def resize(self, size: int) -> None:
+        """Room for as many observations; those that there are stay in their slots, and which slots are free is not changed."""
         arrays = {}
         for key, array in self.arrays.items():
-            arrays[key] = self._allocate(f"final_{key}", (grown, *array.shape[1:]), array.dtype)
-            arrays[key][:used] = array
+            arrays[key] = self._allocate(f"final_{key}", (size, *array.shape[1:]), array.dtype)
+            arrays[key][: len(array)] = array
         self.arrays = arrays
-        self._free.extend(range(grown - 1, used - 1, -1))
 
     def store(self, observation: Mapping[str, np.ndarray]) -> int:
         """
@@ -279,6 +284,37 @@ class ObservationRing:
         """Bytes that are taken now: the ring, the last observations of episodes, and the books."""
         ring = sum(array.nbytes for array in self.observations.values())
         return ring + self.final.nbytes + self.final_slot.nbytes + self.spans.nbytes
+
+    # ------------------------------------------------------------------ saving
+
+    def books(self) -> dict[str, Any]:
+        """What is no large array, for :meth:`restore_books`."""
+        return {
+            "newest_row": self.newest_row,
+            "waiting": self._waiting,
+            "waiting_bytes": self._waiting_bytes,
+            "final_slots": len(next(iter(self.final.arrays.values()))),
+            "free": self.final._free,
+        }
+
+    def restore_books(self, books: Mapping[str, Any]) -> None:
+        """
+        :param books: of a ring like this one; what :meth:`arrays` then gives has their sizes
+        """
+        self.newest_row, self._waiting_bytes = books["newest_row"], books["waiting_bytes"]
+        for key, array in self._waiting.items():
+            array[...] = books["waiting"][key]
+        self.final.resize(books["final_slots"])
+        self.final._free = books["free"]
+
+    def arrays(self, used: int) -> dict[str, np.ndarray]:
+        """
+        :param used: rows that have been written
+        :return: the large arrays up to there by name, the ones that are used and no copies
+        """
+        stores = {"observations": {key: array[:used] for key, array in self.observations.items()}, "final": self.final.arrays}
+        found = {f"{store}/{quote(key, '')}": array for store, arrays in stores.items() for key, array in arrays.items()}
+        return {**found, "spans": self.spans[:used], "final_slot": self.final_slot[:used]}
 
     # ------------------------------------------------------------------ pickling
 

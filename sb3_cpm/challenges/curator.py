@@ -2,7 +2,7 @@
 The challenge curator: from a finished trajectory and the challenger's evaluation of it to a challenge, or none.
 
 Lines 9 to 18 of Algorithm 1 in the report: score every transition, choose the goal, filter, relabel. All state that
-this needs (six coefficients, three tolerances, reward memory and origin) is here, in plain numbers, and is pickled with the
+this needs (six coefficients, three tolerances, reward memory and origin) is here, in plain numbers, and is saved with the
 buffer.
 """
 

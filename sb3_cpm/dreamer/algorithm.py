@@ -7,10 +7,11 @@ last observations, a row for every reset (see :class:`~sb3_cpm.type_aliases.Sequ
 """
 
 import io
-import os
 import pathlib
 import warnings
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -33,10 +34,11 @@ from sb3_cpm.challenger import Challenger, choose_device, rate_entry
 from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
 from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
-from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertainty
+from sb3_cpm.dreamer.start import StartFrom, model_file, read_challenger, take_over_uncertainty
+from sb3_cpm.files import check_finite, verify, write_sealed
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
-from sb3_cpm.world_model.checkpoint import check_finite
+from sb3_cpm.world_model.checkpoint import state_to_check
 from sb3_cpm.world_model.observations import check_action_space, unread
 from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
@@ -354,9 +356,9 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         :param exclude: names of attributes to leave out, on top of SB3's
         :param include: names of attributes to save although SB3 leaves them out
         :raises RuntimeError: if a weight is not finite; the last good file is kept then
+        :raises OSError: if the disk does not take it; the last good file is kept then, too
         """
-        for name, network in self.challenger.networks.items():
-            check_finite(str(path), name, network.state_dict())
+        check_finite(str(path), "model", state_to_check(self.challenger.state_dict(include_rng=False)))
         self._random_state = random_state(self.action_space)
         try:
             if not isinstance(path, (str, pathlib.Path)):
@@ -364,13 +366,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
                 return
             target = pathlib.Path(path)
             target = target if target.suffix else target.with_name(f"{target.name}.zip")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            unfinished = target.with_name(f"{target.name}.{os.getpid()}.tmp")
-            try:
-                super().save(unfinished, exclude, include)
-                os.replace(unfinished, target)
-            finally:
-                unfinished.unlink(missing_ok=True)
+            write_sealed(target, partial(super().save, exclude=exclude, include=include))
         finally:
             self._random_state = None
 
@@ -396,9 +392,11 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         :param force_reset: reset ``env`` before training
         :param kwargs: arguments of the constructor to change; ``preset`` is a name, or the entries that differ from the saved
             ones. ``start_from`` and ``pretrain_steps`` mean nothing to a model that has learnt, and are told with a warning
-        :raises ValueError: for arguments that ask for other networks than the saved ones, and for a model of the other
-            algorithm, which would go on acting as that one does
+        :raises ValueError: for damaged files, for arguments that ask for other networks than the saved ones, and for a model
+            of the other algorithm, which would go on acting as that one does
         """
+        if isinstance(path, (str, pathlib.Path)):
+            verify(model_file(path), "model")
         given = {name: kwargs.pop(name) for name in _OF_CONSTRUCTOR if kwargs.get(name) is not None}
         if given.pop("start_from", None) is not None:
             warnings.warn(f"`start_from` plays no role any more: the model goes on from {path}.", stacklevel=2)
@@ -440,13 +438,17 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load what ``save_replay_buffer`` saved, of this model or of another one in the same environment.
+        Load what ``save_replay_buffer`` or ``CPMBuffer.save`` saved, of this model or of another one in the same environment.
+        The former is a pickle, which can execute anything when it is read: only load such a file if you trust it.
 
         :param path: of the file
         :param truncate_last_traj: end an unfinished episode; False if the same episode goes on in the same environment
         :raises ValueError: if it is no buffer of sequences, or belongs to another environment
         """
-        buffer = load_from_pkl(path, self.verbose)
+        if isinstance(path, (str, pathlib.Path)) and zipfile.is_zipfile(path):  # of CPMBuffer.save
+            buffer: Any = CPMBuffer.load(path)
+        else:
+            buffer = load_from_pkl(path, self.verbose)
         if not isinstance(buffer, EpisodeBuffer):
             raise ValueError(f"{path} holds a {type(buffer).__name__}, {type(self).__name__} learns from a CPMBuffer.")
         _check_buffer(buffer, self)

@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.files import verify
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
 
 
@@ -40,10 +41,15 @@ def read_challenger(source: StartFrom, device: th.device) -> Challenger:
                 + (", which has no challenger yet." if hasattr(source, "challenger") else ".")
             )
         return challenger
-    path = Path(source)
-    if not path.exists() and path.with_name(f"{path.name}.zip").exists():
-        path = path.with_name(f"{path.name}.zip")
+    path = model_file(source)
     return _from_model(path, device) if _is_model(path) else Challenger.load(path, device)
+
+
+def model_file(path: str | os.PathLike) -> Path:
+    """:return: the file that SB3 means by a path, which may lack its ``.zip``"""
+    given = Path(path)
+    zipped = given.with_name(f"{given.name}.zip")
+    return zipped if not given.exists() and zipped.exists() else given
 
 
 def take_over_uncertainty(source: Challenger | None, preset: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,6 +82,7 @@ def _is_model(path: Path) -> bool:
 
 
 def _from_model(path: Path, device: th.device) -> Challenger:
+    verify(path, "model")
     data, params, _ = load_from_zip_file(path, device=device)
     if data is None or "behavior" not in data.get("policy_kwargs", {}):
         raise ValueError(f"{path} is a model of another algorithm: `start_from` takes those of Dreamer and Plan2Explore.")

@@ -109,7 +109,7 @@ def download(env_ids: Sequence[str] = ()) -> Iterator[str]:
             if not asset.problems:
                 continue
             source = DATA_SOURCES[asset.source_id]
-            yield f"{env_id}: {asset.source_id} from {source.url or source.hf_repo_id} ..."
+            yield f"{env_id}: {asset.source_id} from {source.url or source.hf_repo_id} ({_how_checked(source)}) ..."
             try:
                 with _replacing(asset.folder):
                     download_asset.download(source, verbose=False, non_interactive=True)
@@ -120,6 +120,11 @@ def download(env_ids: Sequence[str] = ()) -> Iterator[str]:
                     f"{asset.source_id} could not be downloaded: {error}. On a machine without network, unpack "
                     f"{source.url or source.hf_repo_id} into {asset.folder} by hand."
                 ) from error
+
+
+def _how_checked(source: Any) -> str:
+    """What is known of a download beside that all its files are there; ManiSkill compares the digest where it has one."""
+    return "its SHA-256 is checked" if source.checksum else "UNCHECKED: ManiSkill knows no digest of it"
 
 
 @contextlib.contextmanager

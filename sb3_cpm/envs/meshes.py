@@ -9,8 +9,6 @@ or without), and what comes out is what SAPIEN would have drawn, only coarser. I
 import contextlib
 import functools
 import hashlib
-import os
-import tempfile
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_cpm.envs import vulkan
+from sb3_cpm.files import NotWrittenError, replacing
 
 FORMAT = 1
 """Part of the cache's key: raise it when the result changes."""
@@ -84,12 +83,10 @@ def _load(cached: Path) -> tuple[Part, ...]:
 
 
 def _save(cached: Path, parts: tuple[Part, ...]) -> None:
-    """In one step: several processes may make the same mesh at once."""
-    cached.parent.mkdir(exist_ok=True)
+    """In one step: several processes may make the same mesh at once. Where the disk is full it is made again next time."""
     arrays = {f"{name}{i}": value for i, part in enumerate(parts) for name, value in part._asdict().items()}
-    with tempfile.NamedTemporaryFile(dir=cached.parent, suffix=".npz", delete=False) as file:
-        np.savez_compressed(file, n=np.array(len(parts)), **arrays)
-    os.replace(file.name, cached)
+    with contextlib.suppress(NotWrittenError), replacing(cached) as temporary:
+        np.savez_compressed(temporary, n=np.array(len(parts)), **arrays)
 
 
 # ---------------------------------------------------------------------- making

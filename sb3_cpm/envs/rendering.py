@@ -156,7 +156,10 @@ def cure() -> str:
 def _open_renderer() -> tuple[Renderer, Any]:
     """:return: the renderer and SAPIEN's render system, which fixes the process's Vulkan device"""
     try:
-        import sapien
+        with warnings.catch_warnings():
+            # it means the system's loader, which a private installation does without
+            warnings.filterwarnings("ignore", "Failed to find system libvulkan", UserWarning)
+            import sapien
     except ImportError as error:  # a shared library is missing
         raise RuntimeError(f"SAPIEN cannot be imported: {error}") from error
     try:
@@ -329,13 +332,22 @@ def _driver_version(device: str) -> str:
 
 
 # ---------------------------------------------------------------------- curing it
-def setup_rendering(private: bool = False) -> int:
+def setup_rendering(private: bool = False, system: bool = False) -> int:
     """
     Make this machine able to render and say what is being done. Does nothing if it is able already. Asks nothing.
 
-    :param private: install software Vulkan into the user's cache folder even as root
+    What is missing is installed into the user's cache folder, also for root: the system stays as it is.
+
+    :param private: do so even where the machine's own driver works
+    :param system: install it for the whole machine instead, which needs root: packages with apt, and on Debian 12 a new file
+        in ``/etc/apt/sources.list.d`` with Debian's backports suite
     :return: exit status, 0 if SAPIEN renders in the end
+    :raises ValueError: if both are asked for, or the second without being root
     """
+    if private and system:
+        raise ValueError("Install privately or for the system: leave one of --private and --system out.")
+    if system and os.geteuid() != 0:
+        raise ValueError("Installing for the whole machine needs root: run it as root, or leave --system out.")
     print("Rendering: trying this machine's own Vulkan driver ...", flush=True)
     probe = probe_renderer(use_private=False)
     if probe.renderer is not None and not private:
@@ -357,7 +369,7 @@ def setup_rendering(private: bool = False) -> int:
         print("Rendering: FAILED. Software Vulkan can be installed automatically on Linux only; install a graphics driver.")
         return 1
     try:
-        if os.geteuid() == 0 and not private:
+        if system:
             print("Rendering: installing Mesa's software Vulkan (lavapipe) for the whole machine ...", flush=True)
             vulkan_install.install_system(print)
         else:

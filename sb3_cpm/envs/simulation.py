@@ -85,7 +85,7 @@ def check_gpu_simulation(sim_backend: str = "physx_cuda") -> None:
         # what is left of a broken download would be taken for the library for ever after
         where = f"It is there, but cannot be loaded ({error}): delete it" if library.exists() else f"It is not there ({error})"
         raise RuntimeError(
-            f"Simulation on the GPU needs PhysX's GPU library, {library}. {where}. SAPIEN downloads it if there is a network; "
-            f"else unzip https://github.com/sapien-sim/physx-precompiled/releases/download/{library.parent.name}/linux-so.zip "
-            f"into {library.parent}."
+            f"Simulation on the GPU needs PhysX's GPU library, {library}. {where}. SAPIEN downloads it if there is a network "
+            "(unchecked: it knows no digest of it); else unzip https://github.com/sapien-sim/physx-precompiled/releases/download/"
+            f"{library.parent.name}/linux-so.zip into {library.parent}."
         ) from error

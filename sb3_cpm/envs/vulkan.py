@@ -5,6 +5,7 @@ for its drivers. How it gets there is told in :mod:`sb3_cpm.envs.vulkan_install`
 
 import ctypes
 import os
+import stat
 import struct
 import sys
 import tempfile
@@ -17,23 +18,58 @@ DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
 
 def cache_folder() -> Path:
     """
+    Native libraries are loaded from there, so nobody else may have put them there: it belongs to this user or to root, and
+    others cannot write to it. A new one is made with mode 0700.
+
     :return: where everything generated is kept: ``$SB3_CPM_CACHE``, else the user's cache folder, else (home not
         writable) a folder of this user under the system's temporary folder. Exists.
+    :raises RuntimeError: if there is no such folder, or ``$SB3_CPM_CACHE`` is one that others could have filled
     """
+    named = os.environ.get("SB3_CPM_CACHE")
     candidates = [
-        os.environ.get("SB3_CPM_CACHE"),
+        named,
         os.path.join(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "sb3_cpm"),
-        os.path.join(tempfile.gettempdir(), f"sb3_cpm-{os.getuid()}"),
+        os.path.join(tempfile.gettempdir(), f"sb3_cpm-{os.geteuid()}"),
     ]
+    problems = []
     for candidate in filter(None, candidates):
         folder = Path(candidate)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _tighten(folder)
+            problem = distrust(folder)
+        except OSError as error:
+            problems.append(f"{folder}: {error.strerror}")
             continue
-        if os.access(folder, os.W_OK):
+        if problem is not None and candidate == named:
+            raise RuntimeError(f"SB3_CPM_CACHE: {problem}, and native libraries are loaded from there. {_CURE}")
+        if problem is None and os.access(folder, os.W_OK):
             return folder
-    raise RuntimeError(f"None of these folders can be written: {candidates}. Set SB3_CPM_CACHE to one that can.")
+        problems.append(problem or f"{folder} cannot be written")
+    raise RuntimeError(f"There is no folder to keep libraries in: {'; '.join(problems)}. {_CURE}")
+
+
+_CURE = "Set SB3_CPM_CACHE to a folder of your own that only you can write to (chmod 700)."
+
+
+def _tighten(path: Path) -> None:
+    """What is ours and our group could write to, as a umask of 002 makes it, is for us alone to write from here on."""
+    status = path.lstat()
+    if not stat.S_ISLNK(status.st_mode) and status.st_uid == os.geteuid() and status.st_mode & 0o022 == 0o020:
+        path.chmod(stat.S_IMODE(status.st_mode) & ~0o020)
+
+
+def distrust(path: Path) -> str | None:
+    """
+    :param path: of a file or folder
+    :return: who else could have put there what it holds; None if nobody but this user and root
+    """
+    for status in (path.lstat(), path.stat()):  # a symbolic link and what it leads to
+        if status.st_uid not in (os.geteuid(), 0):
+            return f"{path} belongs to another user (number {status.st_uid})"
+    if status.st_mode & 0o022:
+        return f"{path} can be written by others (mode {stat.S_IMODE(status.st_mode):o})"
+    return None
 
 
 def private_folder() -> Path:
@@ -62,11 +98,19 @@ def activate_private() -> bool:
     process crashes.
 
     :return: whether a private installation is in use
+    :raises RuntimeError: if somebody else could have put anything there
     """
     if not private_in_use():
         return False
     icd = private_folder() / "icd.json"
     waiting = sorted(_libraries(private_folder() / "root"))
+    for path in (private_folder(), icd, *waiting):
+        _tighten(path)
+        problem = distrust(path)
+        if problem is not None:
+            raise RuntimeError(
+                f"{problem}, so it is not loaded. Remove {private_folder()} and run `python -m sb3_cpm setup-rendering` again."
+            )
     while waiting:
         failed = [path for path in waiting if not _loads(path)]
         if len(failed) == len(waiting):

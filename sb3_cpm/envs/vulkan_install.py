@@ -1,10 +1,10 @@
 """
-Installing software Vulkan (Mesa's lavapipe) with apt: as root for the whole machine, or as anybody into a private folder that
-:mod:`sb3_cpm.envs.vulkan` then uses.
+Installing software Vulkan (Mesa's lavapipe) with apt: as anybody into a private folder that :mod:`sb3_cpm.envs.vulkan` then
+uses, or, if root asks for it, for the whole machine.
 
 SAPIEN needs Mesa 24.3 or newer. Debian 12 has that in its backports suite only; Debian 13 and an updated Ubuntu 24.04 have it
 as they are. Nothing here asks a question, and nothing names a server: mirrors and signing keys are those that the machine
-already uses.
+already uses. So what is downloaded is checked by apt as everything else is on this machine.
 """
 
 import json

@@ -4,27 +4,40 @@ Checkpoints from which a killed run goes on as if nothing had happened.
 SB3 restores neither random states nor environments. So a run makes a fresh start at every checkpoint, whether it was killed or
 not: all random generators are seeded from (seed, step), and the environments begin new episodes. What a resumed run does from
 there on is then the same as what an unbroken one does.
+
+Of its files only ``model.zip``, which is SB3's own, can execute code when it is read; all others are arrays and JSON.
 """
 
 import os
-import pickle
 import shutil
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_cpm.buffers import EpisodeBuffer
 from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.experiments.stored_run import DamagedRunError
+from sb3_cpm.files import Archive, DamagedFileError, disk_errors_named, verify, write_archive
+from sb3_cpm.packing import pack, unpack
 from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.run.folder import save_model
 
 NAME = "checkpoint"
+MODEL, BUFFER, STATE = "model.zip", "replay_buffer.npz", "state.npz"
+
+#: Attributes of SB3's replay buffers that come from their arguments.
+_OF_ARGUMENTS = {"observation_space", "action_space", "obs_shape", "device", "env", "goal_selection_strategy"}
 
 
 def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra: dict[str, Any]) -> None:
@@ -35,35 +48,74 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCall
     :param model: with its replay buffer, where it has one
     :param callbacks: challengers among them are saved
     :param extra: plain data to be given back by :func:`load_extra`
+    :raises NotWrittenError: if the disk does not take it; the last one stays
+    :raises NotFiniteError: if a weight is not finite; the last one stays, too
     """
     new, current, old = (folder / f"{NAME}{suffix}" for suffix in (".new", "", ".old"))
     shutil.rmtree(new, ignore_errors=True)
-    new.mkdir()
-    model.save(new / "model.zip")
-    if isinstance(model, OffPolicyAlgorithm):
-        model.save_replay_buffer(new / "replay_buffer.pkl")
+    with disk_errors_named(new):
+        new.mkdir()
+    try:
+        _write(new, model, callbacks, extra)
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+    with disk_errors_named(current):
+        shutil.rmtree(old, ignore_errors=True)
+        if current.exists():
+            os.replace(current, old)
+        os.replace(new, current)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _write(new: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra: dict[str, Any]) -> None:
+    save_model(new / MODEL, model)
+    arrays: dict[str, np.ndarray] = {}
+    content: dict[str, Any] = {}
+    buffer = getattr(model, "replay_buffer", None)
+    if isinstance(buffer, EpisodeBuffer):
+        buffer.save(new / BUFFER)
+    elif buffer is not None:
+        content["buffer"] = _state_of_buffer(buffer, arrays)
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
-        normalize.save(str(new / "vecnormalize.pkl"))
+        content["normalization"] = pack({name: _numbers(one) for name, one in _statistics(normalize).items()})
     next_training = {}
     for index, callback in enumerate(callbacks):
         if isinstance(callback, ChallengerCallback) and callback.challenger is not None:
             callback.save(new / f"challenger{index}.pt")
             next_training[index] = callback._next_training
-    (new / "state.pkl").write_bytes(pickle.dumps({"next_training": next_training, **extra}))
-    shutil.rmtree(old, ignore_errors=True)
-    if current.exists():
-        os.replace(current, old)
-    os.replace(new, current)
-    shutil.rmtree(old, ignore_errors=True)
+    content["extra"] = pack({"next_training": next_training, **extra})
+    write_archive(new / STATE, content, arrays)
 
 
 def find_checkpoint(folder: Path) -> Path | None:
-    """:return: the newest complete checkpoint of a run folder"""
+    """
+    :param folder: of a run
+    :return: its newest complete checkpoint, whole
+    :raises DamagedRunError: if it is not what was written, or was written by an earlier version
+    """
     for name in (NAME, f"{NAME}.old"):
-        if (folder / name / "state.pkl").exists():
-            return folder / name
+        checkpoint = folder / name
+        if (checkpoint / "state.pkl").exists():
+            raise DamagedRunError(
+                f"{checkpoint} was written by an earlier sb3_cpm, as pickles, which can execute anything when they are read: "
+                f"finish the run with that version, or remove {checkpoint} to begin it anew."
+            )
+        if (checkpoint / STATE).exists():
+            _check(checkpoint)
+            return checkpoint
     return None
+
+
+def _check(checkpoint: Path) -> None:
+    try:
+        for path in sorted(checkpoint.iterdir()):
+            if not verify(path):
+                raise DamagedFileError(f"{path} has no digest: this package did not write it.")
+    except DamagedFileError as error:
+        told = str(error).replace(" Take an earlier one.", "")  # there is none
+        raise DamagedRunError(f"{told} Remove {checkpoint} to begin the run anew.") from error
 
 
 def remove_checkpoints(folder: Path) -> None:
@@ -76,23 +128,85 @@ def load_extra(checkpoint: Path) -> dict[str, Any]:
     :return: what was given to :func:`save_checkpoint`, and ``next_training`` of the challengers
     :raises ValueError: if the file is damaged
     """
-    path = checkpoint / "state.pkl"
-    try:
-        return pickle.loads(path.read_bytes())
-    except (pickle.UnpicklingError, EOFError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}). Remove the folder {checkpoint} to begin the run anew.") from error
+    with Archive(checkpoint / STATE, "checkpoint") as archive:
+        return unpack(archive.content["extra"])
 
 
 def restore_buffer(checkpoint: Path, model: BaseAlgorithm) -> None:
     """:param model: loaded from ``model.zip`` of this checkpoint; gets its replay buffer and normalization back"""
-    if isinstance(model, OffPolicyAlgorithm):
-        model.load_replay_buffer(checkpoint / "replay_buffer.pkl", truncate_last_traj=False)
-    normalize = model.get_vec_normalize_env()
-    if normalize is not None:
-        from stable_baselines3.common.vec_env import VecNormalize
+    buffer = getattr(model, "replay_buffer", None)
+    with Archive(checkpoint / STATE, "checkpoint") as archive:
+        if isinstance(buffer, EpisodeBuffer):
+            loaded = type(buffer).load(checkpoint / BUFFER, env=buffer.env)
+            loaded.device = model.device
+            model.replay_buffer = loaded  # type: ignore[attr-defined]
+        elif buffer is not None:
+            _restore_buffer(buffer, archive)
+        normalize = model.get_vec_normalize_env()
+        if normalize is not None:
+            saved = unpack(archive.content["normalization"])
+            for name, one in _statistics(normalize).items():
+                one.mean, one.var, one.count = saved[name]
 
-        saved = VecNormalize.load(str(checkpoint / "vecnormalize.pkl"), normalize.venv)
-        normalize.obs_rms, normalize.ret_rms = saved.obs_rms, saved.ret_rms
+
+def _statistics(normalize: VecNormalize) -> dict[str, RunningMeanStd]:
+    """What VecNormalize has counted, by name."""
+    counted = getattr(normalize, "obs_rms", None)  # not there with norm_obs=False
+    of_observations = counted if isinstance(counted, dict) else {"": counted}
+    found = {"returns": normalize.ret_rms, **{f"observations {key}": one for key, one in of_observations.items()}}
+    return {name: one for name, one in found.items() if isinstance(one, RunningMeanStd)}
+
+
+def _numbers(statistics: RunningMeanStd) -> tuple[Any, ...]:
+    return statistics.mean, statistics.var, statistics.count
+
+
+def _state_of_buffer(buffer: ReplayBuffer, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """
+    A replay buffer of SB3's own, attribute by attribute, as far as it has been filled.
+
+    :param buffer: the buffer
+    :param arrays: its arrays are added to these
+    :return: the rest
+    :raises ValueError: for a buffer that holds something else than arrays and numbers
+    """
+    used = buffer.buffer_size if buffer.full else buffer.pos
+    rest = {}
+    for name, value in vars(buffer).items():
+        parts = value if isinstance(value, dict) else {None: value}
+        if name in _OF_ARGUMENTS:
+            continue
+        if all(isinstance(part, np.ndarray) and not part.dtype.hasobject for part in parts.values()):
+            for key, part in parts.items():
+                per_transition = part.shape[:2] == (buffer.buffer_size, buffer.n_envs)
+                arrays[_name(name, key)] = part[:used] if per_transition else part
+        elif isinstance(value, np.ndarray):  # HER's infos: dicts, empty ones unless they are asked for
+            rest[name] = pack(value[:used].tolist() if getattr(buffer, "copy_info_dict", True) else [], name=name)
+        else:
+            rest[name] = pack(value, name=f"{type(buffer).__name__}.{name}")
+    return rest
+
+
+def _restore_buffer(buffer: ReplayBuffer, archive: Archive) -> None:
+    """:param buffer: an empty one like the one that was saved"""
+    saved = {name: unpack(value) for name, value in archive.content["buffer"].items()}
+    for name, value in vars(buffer).items():
+        if name in _OF_ARGUMENTS:
+            continue
+        if name in saved and not isinstance(value, np.ndarray):
+            setattr(buffer, name, saved[name])
+        elif name in saved:
+            for row, infos in enumerate(saved[name]):
+                for env_idx, info in enumerate(infos):
+                    value[row, env_idx] = info
+        else:
+            for key, part in (value if isinstance(value, dict) else {None: value}).items():
+                stored = archive.array(_name(name, key))
+                part[: len(stored)] = stored
+
+
+def _name(attribute: str, key: str | None) -> str:
+    return attribute if key is None else f"{attribute}/{quote(key, '')}"
 
 
 class ChallengerRestorer(BaseCallback):
@@ -106,10 +220,7 @@ class ChallengerRestorer(BaseCallback):
     def __init__(self, checkpoint: Path, callbacks: list[BaseCallback]) -> None:
         super().__init__()
         self.checkpoint, self.callbacks = checkpoint, callbacks
-        extra = load_extra(checkpoint)
-        if "next_training" not in extra:
-            raise ValueError(f"{checkpoint} was written by an earlier sb3_cpm: finish the run with that, or delete it.")
-        self.next_training: dict[int, int] = extra["next_training"]
+        self.next_training: dict[int, int] = load_extra(checkpoint)["next_training"]
 
     def _on_training_start(self) -> None:
         for index, step in self.next_training.items():

@@ -12,12 +12,8 @@ The folder of one run: who may write there, and what its state is.
     checkpoint/       while the run goes on
 """
 
-import contextlib
-import fcntl
 import functools
 import hashlib
-import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +21,8 @@ import yaml
 
 from sb3_cpm import __version__
 from sb3_cpm.experiments.specification import RunSpec, fingerprint
-from sb3_cpm.run.folder import versions, write_text, write_yaml
+from sb3_cpm.files import LockedError, locked, write_text
+from sb3_cpm.run.folder import versions, write_yaml
 from sb3_cpm.run.settings import FIRST_SEED
 
 if TYPE_CHECKING:
@@ -36,10 +33,6 @@ CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
 
 class OtherResultError(ValueError):
     """A folder holds something else than what is asked for."""
-
-
-class LockedError(RuntimeError):
-    """Another process is writing a folder."""
 
 
 def description(spec: RunSpec, agent: "Agent") -> dict[str, Any]:
@@ -72,28 +65,6 @@ def code_digest() -> str:
     for path in sorted(root.rglob("*.py")):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """
-    Let nobody else write this folder; the lock goes with the process, however that ends.
-
-    :raises LockedError: while another process holds it
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)  # the folder itself: a lock file would have to be removed, which is a race
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        raise LockedError(
-            f"{folder} is being written by another process. Wait for it, or choose another folder with --results."
-        ) from error
-    try:
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from sb3_cpm.experiments.specification import RunResult, RunSpec
 from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
 from sb3_cpm.experiments.tables import COLUMNS, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
+from sb3_cpm.files import DamagedFileError, NotFiniteError, NotWrittenError, locked
 from sb3_cpm.run.settings import check_seed
 from sb3_cpm.zoo.agents import Built, load_agent
 
@@ -48,7 +49,7 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
     config = run_folder.description(spec, agent)
     th.set_num_threads(1)
     th.set_flush_denormal(True)  # Adam's averages of units that are off decay to numbers that cost CPUs a tenth of an update
-    with run_folder.locked(folder):
+    with locked(folder):
         note = run_folder.check_belongs(folder, config)
         if run_folder.is_finished(folder):
             _check_whole(folder)
@@ -106,8 +107,7 @@ class Watcher(BaseCallback):
         self.spec, self.folder, self.built, self.found, self.tell = spec, folder, built, found, tell
         self.eval_env: VecEnv = built.make_eval_env()
         state: dict[str, Any] = {} if found is None else checkpoints.load_extra(found)
-        sizes = state.get("sizes", {})
-        self.tables = {name: Table(folder / f"{name}.csv", columns, sizes.get(name, 0)) for name, columns in COLUMNS.items()}
+        self.tables = self._open_tables(state.get("tables", {}))
         #: Wall-clock seconds of earlier processes.
         self.seconds_before: float = state.get("seconds", 0.0)
         self._started = time.perf_counter()
@@ -115,6 +115,12 @@ class Watcher(BaseCallback):
         self._next_dump: int = state.get("next_dump", 0)
         self._goes_on = found is not None
         self._succeeded: list[bool | None] = []
+
+    def _open_tables(self, states: dict[str, Any]) -> dict[str, Table]:
+        try:
+            return {name: Table(self.folder / f"{name}.csv", one, **states.get(name, {})) for name, one in COLUMNS.items()}
+        except DamagedFileError as error:
+            raise DamagedRunError(f"{error} Remove {self.folder} to run it again.") from error
 
     def learn(self) -> None:
         """Train from where the model is to the end of the run."""
@@ -207,8 +213,14 @@ class Watcher(BaseCallback):
         return f"{self.spec.name}: step {step}/{self.spec.steps}, return {mean:.2f}{success}{left}"
 
     def _save(self) -> None:
+        try:
+            self._save_checkpoint()
+        except (NotWrittenError, NotFiniteError) as error:
+            self.tell(f"{self.spec.name}: no checkpoint at step {self.num_timesteps}, the run goes on. {error}")
+
+    def _save_checkpoint(self) -> None:
         state = {
-            "sizes": {name: table.size for name, table in self.tables.items()},
+            "tables": {name: table.state() for name, table in self.tables.items()},
             "seconds": self.seconds_before + time.perf_counter() - self._started,
             "next_evaluation": self._next_evaluation,
             "next_dump": self._next_dump,

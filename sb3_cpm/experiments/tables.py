@@ -1,9 +1,12 @@
 """CSV files that survive a killed run: every row is on disk at once; a resumed run cuts off what came after its checkpoint."""
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
+
+from sb3_cpm.files import GrowingFile
 
 EVALUATIONS = (
     "experiment",
@@ -29,38 +32,36 @@ class Table:
 
     :param path: of the file, made with a header where there is none
     :param columns: its columns
-    :param size: bytes to keep of a file that is there already; None: all
-    :raises ValueError: if the file has fewer
+    :param size: bytes to keep of a file that is there already
+    :param digest: SHA-256 of these; None: they are believed
+    :raises DamagedFileError: if the file has fewer, or others
     """
 
-    def __init__(self, path: Path, columns: Sequence[str], size: int | None = None) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], size: int = 0, digest: str | None = None) -> None:
         self.path, self.columns = path, tuple(columns)
-        there = path.stat().st_size if path.exists() else 0
-        if size is not None and there < size:
-            raise ValueError(
-                f"{path} has {there} bytes, it had {size} when the checkpoint beside it was made: it was damaged. "
-                "Remove the folder to run it again."
-            )
-        if there and size is not None:
-            with path.open("rb+") as file:
-                file.truncate(size)
-        self._file: TextIO = path.open("a", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file)
-        if self._file.tell() == 0:
-            self._writer.writerow(self.columns)
-            self._file.flush()
+        self._file = GrowingFile(path, size, digest)
+        if size == 0:
+            self._write(self.columns)
 
     def add(self, row: Sequence[Any]) -> None:
         """:param row: one value per column; None becomes an empty cell, a bool 0 or 1"""
-        self._writer.writerow([_cell(value) for value in row])
-        self._file.flush()
+        self._write([_cell(value) for value in row])
 
-    @property
-    def size(self) -> int:
-        """Bytes so far."""
-        return self._file.tell()
+    def _write(self, cells: Sequence[Any]) -> None:
+        text = io.StringIO()
+        csv.writer(text).writerow(cells)
+        self._file.append(text.getvalue())
+
+    def state(self) -> dict[str, Any]:
+        """
+        :return: size and digest, once everything so far is on the disk
+        :raises NotWrittenError: if it cannot be
+        """
+        self._file.sync()
+        return {"size": self._file.size, "digest": self._file.digest}
 
     def close(self) -> None:
+        """:raises NotWrittenError: if rows are still missing on the disk"""
         self._file.close()
 
 

@@ -13,6 +13,7 @@ from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.specification import RunSpec
 from sb3_cpm.experiments.stored_run import read_run
 from sb3_cpm.experiments.tables import EVALUATIONS, Table
+from sb3_cpm.files import write_bytes
 
 
 def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:
@@ -53,9 +54,9 @@ def take_over(spec: RunSpec, config: dict[str, Any], twin: Path, results: Path) 
     names = {"experiment": spec.experiment, "agent": spec.agent, "env": spec.env}
     for path in twin.glob("*.csv"):
         if path.stem != "evaluations":
-            (folder / path.name).write_bytes(path.read_bytes())
+            write_bytes(folder / path.name, path.read_bytes())
             continue
-        table = Table(folder / path.name, EVALUATIONS, 0)
+        table = Table(folder / path.name, EVALUATIONS)
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 table.add([{**row, **names}[column] for column in EVALUATIONS])

@@ -1,17 +1,21 @@
-"""The folder that a run leaves: names that are never taken twice, and files that are complete or not there."""
+"""The folder that a run leaves: a name that is never taken twice, one process that writes it, and the model in it."""
 
+import itertools
 import os
 import platform
+import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cpm import __version__
+from sb3_cpm.files import LOCK, check_finite, disk_errors_named, locked, write_sealed, write_text
 from sb3_cpm.run.settings import TrainSettings
 
 PACKAGES = (
@@ -26,52 +30,92 @@ PACKAGES = (
 )
 
 
-def make_run_folder(settings: TrainSettings) -> Path:
-    """
-    Make a new folder for the results.
+#: What a run has written before its first step, so that a run that never took one takes it away again.
+_BEFORE_THE_FIRST_STEP = (
+    *("config.yml", "versions.yml", "progress.csv", "episodes.csv", "proposals.csv", "coefficients.csv", "evaluations.csv"),
+    *("model.zip", "challenger.pt", "tensorboard", LOCK),
+)
 
-    :param settings: of the run
-    :return: ``settings.run_folder``, or else the next free name below ``runs/``
+
+class RunFolder:
+    """
+    A folder for the results of one run, locked while that goes on.
+
+    :param settings: of the run; ``run_folder`` names the folder, else it is the next free name below ``runs/``
     :raises ValueError: when the folder asked for already holds something
+    :raises LockedError: while another process writes it
+    :raises NotWrittenError: where no folder can be made
     """
-    if settings.run_folder is not None:
-        folder = Path(settings.run_folder)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ValueError(
-                f"The run folder {folder} exists and is not empty. Nothing is ever overwritten: choose another name with "
-                f"--run-folder, leave it out to get the next free name, or remove {folder} yourself."
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
-    name = f"{settings.env.rpartition(':')[2].replace('/', '-')}-{settings.algorithm}-seed{settings.seed}"
-    number = 1
-    while True:
-        folder = Path("runs") / (name if number == 1 else f"{name}-{number}")
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except FileExistsError:
-            number += 1
+
+    def __init__(self, settings: TrainSettings) -> None:
+        with disk_errors_named(settings.run_folder or "runs"):
+            self.path, self._made = _next(settings) if settings.run_folder is None else _named(settings.run_folder)
+        self._lock = ExitStack()
+        self._lock.enter_context(locked(self.path))
+        if any(entry.name != LOCK for entry in self.path.iterdir()):
+            self.release()
+            raise ValueError(_not_empty(self.path))
+
+    def release(self) -> None:
+        """The run has ended."""
+        self._lock.close()
+
+    def discard(self) -> None:
+        """Take away what a run that took no step has written, and the folder, if it was made for it. Nothing else."""
+        for name in _BEFORE_THE_FIRST_STEP:
+            path = self.path / name
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        self.release()
+        if self._made:
+            with suppress(OSError):  # somebody else has put something there
+                self.path.rmdir()
 
 
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """
-    Give a temporary path beside ``path`` (with the same suffix), and rename it once everything is written.
-
-    :param path: the file to write or replace
-    """
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+def _named(name: str) -> tuple[Path, bool]:
+    """:return: the folder, and whether it was not there before"""
+    folder = Path(name)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(_not_empty(folder))
     try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        return folder, False
+    return folder, True
 
 
-def write_text(path: Path, text: str) -> None:
-    with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+def _next(settings: TrainSettings) -> tuple[Path, bool]:
+    """:return: likewise, of the next free name"""
+    name = f"{settings.env.rpartition(':')[2].replace('/', '-')}-{settings.algorithm}-seed{settings.seed}"
+    for number in itertools.count(1):
+        folder = Path("runs") / (name if number == 1 else f"{name}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            break
+    return folder, True
+
+
+def _not_empty(folder: Path) -> str:
+    return (
+        f"The run folder {folder} exists and is not empty. Nothing is ever overwritten: choose another name with "
+        f"--run-folder, leave it out to get the next free name, or remove {folder} yourself."
+    )
+
+
+def save_model(path: Path, model: BaseAlgorithm) -> None:
+    """
+    SB3's own archive, written whole, with a digest.
+
+    :param path: of the file
+    :param model: to save
+    :raises NotFiniteError: if a weight is not finite; the last good file stays
+    :raises NotWrittenError: if the disk does not take it; the last good file stays, too
+    """
+    _, variables = model._get_torch_save_params()
+    check_finite(path, "model", {name: recursive_getattr(model, name, None) for name in variables} | model.get_parameters())
+    write_sealed(path, model.save)
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_cpm.run.folder import atomic, write_text
+from sb3_cpm.files import replacing, write_text
 
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#2b6cb0", "#dd6b20", "#2f855a", "#c53030", "#718096", "#6b46c1"
 PINK, BLACK = "#d53f8c", "#1a202c"
@@ -45,7 +45,7 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    with atomic(path) as temporary:
+    with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:], facecolor="white")
     plt.close(figure)
 

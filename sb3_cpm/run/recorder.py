@@ -6,10 +6,11 @@ are kept in memory with their camera frames for the challenge gallery.
 """
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -19,25 +20,28 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 from sb3_cpm.buffers import EXECUTED_ACTION, Episode
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenges import REWARD_TERMS, Proposal
+from sb3_cpm.files import GrowingFile
 
 
 class CSVTable:
     """
-    A CSV file whose columns are those of its first row; complete after every row.
+    A CSV file whose columns are those of its first row; complete after every row, or as soon as the disk takes it.
 
     :param path: the file, which must not exist yet
     """
 
     def __init__(self, path: Path) -> None:
-        self._file: TextIO = path.open("x", newline="", encoding="utf-8")
-        self._writer: csv.DictWriter | None = None
+        self._file = GrowingFile(path)
+        self._columns: list[str] | None = None
 
     def add(self, row: dict[str, Any]) -> None:
-        if self._writer is None:
-            self._writer = csv.DictWriter(self._file, fieldnames=list(row), extrasaction="ignore")
-            self._writer.writeheader()
-        self._writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-        self._file.flush()
+        text = io.StringIO()
+        if self._columns is None:
+            self._columns = list(row)
+            csv.writer(text).writerow(self._columns)
+        values = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
+        csv.DictWriter(text, self._columns, extrasaction="ignore").writerow(values)
+        self._file.append(text.getvalue())
 
     def close(self) -> None:
         self._file.close()

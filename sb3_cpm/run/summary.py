@@ -6,7 +6,7 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from sb3_cpm.run.folder import write_text
+from sb3_cpm.files import write_text
 
 #: Rows of the time table in this order, where there are such; all other sections of the stopwatch follow.
 SECTIONS = (

@@ -6,7 +6,6 @@ closed. SB3 does the training; this module only prepares, watches and tidies up.
 """
 
 import contextlib
-import shutil
 import signal
 import sys
 import time
@@ -18,7 +17,7 @@ from typing import Any
 import torch as th
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
@@ -28,6 +27,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
+from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
 from sb3_cpm.run.arguments import misspelt_names_told
@@ -79,8 +79,9 @@ class Run:
         self.title = f"CPM-{settings.algorithm.upper()} on {settings.env}, seed {settings.seed}"
         th.set_num_threads(settings.threads)
         with contextlib.ExitStack() as undo:
-            self.folder = run_folder.make_run_folder(settings)
-            undo.callback(shutil.rmtree, self.folder, ignore_errors=True)
+            self._folder = run_folder.RunFolder(settings)
+            undo.callback(self._folder.discard)
+            self.folder = self._folder.path
             self.env = make_vec_env(settings.env, settings.n_envs, settings.seed, **settings.env_kwargs)
             undo.callback(self.env.close)
             self.model = make_model(settings, self.env)
@@ -88,18 +89,15 @@ class Run:
             self.evaluation_env = make_env(settings.env, render_mode="rgb_array", **settings.env_kwargs)
             undo.callback(self.evaluation_env.close)
             self.challenger = make_challenger(settings)
+            self._describe()
             undo.pop_all()
-        self._describe()
         self.setup_seconds = time.perf_counter() - self.started
 
     def _describe(self) -> None:
         run_folder.write_yaml(self.folder / "config.yml", self.settings.as_dict())
         run_folder.write_yaml(self.folder / "versions.yml", run_folder.versions())
-        formats = [
-            make_output_format("csv", str(self.folder)),
-            make_output_format("tensorboard", str(self.folder / "tensorboard")),
-        ]
-        self.model.set_logger(Logger(str(self.folder), formats))
+        formats = [("csv", self.folder), ("tensorboard", self.folder / "tensorboard")]
+        self.model.set_logger(Logger(str(self.folder), [_patient_log(*one) for one in formats]))
         total = self.settings.steps or 0
         self.recorder = Recorder(self.folder, self.challenger, total)
         self.evaluator = Evaluator(
@@ -144,15 +142,18 @@ class Run:
         if self.progress_bar is None:
             say(news)
         with self.challenger.stopwatch.section("pictures and saving"):
-            self._save("model.zip", self.model.save)
-            self._save_challenger()
+            for save in (self._save_model, self._save_challenger):
+                try:
+                    save()
+                except (NotWrittenError, NotFiniteError) as error:
+                    say(f"{error}. The run goes on, and tries again after the next evaluation.".replace("..", "."))
 
     # ------------------------------------------------------------------ what is left behind
 
     def _discard(self) -> None:
         """The run ended before its first step, so there is nothing to keep: no empty folder stays behind."""
         self._close()
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self._folder.discard()
 
     def _close(self) -> None:
         for what, close in (
@@ -174,9 +175,9 @@ class Run:
         folder, finished = self.folder, outcome == "finished"
         say(f"Run {outcome}, step {self.model.num_timesteps}: writing everything to {folder}")
         jobs: list[tuple[str, Callable[[], Any]]] = [
-            ("the model", lambda: self._save("model.zip", self.model.save)),
+            ("the model", self._save_model),
             ("the challenger", self._save_challenger),
-            ("the replay buffer", lambda: self._save("replay_buffer.pkl", self.model.save_replay_buffer)),
+            ("the replay buffer", self._save_replay_buffer),
             ("the logs", lambda: self.model.logger.dump(self.model.num_timesteps)),
             ("the learning curve", lambda: plots.learning_curve(folder, self.title)),
             ("the coefficients", lambda: plots.coefficients(folder, self.title)),
@@ -189,16 +190,20 @@ class Run:
                 _attempt(what, job)
             self._close()
         summary = self._summary(outcome)
-        summary.write(folder)
+        _attempt("the summary", lambda: summary.write(folder))
+        self._folder.release()
         return summary
 
-    def _save(self, name: str, save: Callable[[Path], None]) -> None:
-        with run_folder.atomic(self.folder / name) as temporary:
-            save(temporary)
+    def _save_model(self) -> None:
+        run_folder.save_model(self.folder / "model.zip", self.model)
 
     def _save_challenger(self) -> None:
         if self.challenger.challenger is not None:
-            self._save("challenger.pt", self.challenger.save)
+            self.challenger.save(self.folder / "challenger.pt")
+
+    def _save_replay_buffer(self) -> None:
+        assert isinstance(self.model.replay_buffer, CPMBuffer)
+        self.model.replay_buffer.save(self.folder / "replay_buffer.npz")
 
     def _draw_gallery(self) -> None:
         shots = self.recorder.shots.choose(N_SHOTS)
@@ -342,9 +347,35 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
+def _patient_log(kind: str, folder: Path) -> KVWriter:
+    """
+    :param kind: "csv" or "tensorboard"
+    :param folder: where it goes
+    :return: SB3's writer, which a full disk does not end the run by
+    """
+    with disk_errors_named(folder):
+        output = make_output_format(kind, str(folder))
+    write, told = output.write, False
+
+    def attempt(*args: Any) -> None:
+        nonlocal told
+        try:
+            with disk_errors_named(folder):
+                write(*args)
+        except NotWrittenError as error:
+            if not told:
+                say(f"{error}. The run goes on; what is logged meanwhile may be missing.")
+            told = True
+
+    output.write = attempt  # type: ignore[method-assign,assignment]
+    return output
+
+
 def _attempt(what: str, job: Callable[[], Any]) -> None:
     try:
         job()
+    except (NotWrittenError, NotFiniteError) as error:
+        print(f"Could not write {what}: {error}", file=sys.stderr, flush=True)
     except Exception:
         print(f"Could not write or close {what}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
 

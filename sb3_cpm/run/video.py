@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_cpm.run.folder import atomic
+from sb3_cpm.files import replacing
 
 
 def write_video(folder: Path, name: str, frames: Sequence[np.ndarray], fps: int = 10) -> Path:
@@ -26,11 +26,11 @@ def write_video(folder: Path, name: str, frames: Sequence[np.ndarray], fps: int 
     images = [_even(frame) for frame in frames]
     try:
         path = folder / f"{name}.mp4"
-        with atomic(path) as temporary:
+        with replacing(path) as temporary:
             imageio.mimwrite(temporary, images, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2)
     except (ImportError, OSError, RuntimeError, ValueError):
         path = folder / f"{name}.gif"
-        with atomic(path) as temporary:
+        with replacing(path) as temporary:
             imageio.mimwrite(temporary, images, format="GIF", duration=1000 / fps, loop=0)
     return path
 

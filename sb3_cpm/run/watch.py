@@ -18,12 +18,13 @@ import yaml
 
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.files import write_bytes
 from sb3_cpm.run import watch_pictures as pictures
-from sb3_cpm.run.folder import atomic
 from sb3_cpm.run.plots import read_csv
 from sb3_cpm.type_aliases import Evaluation
 
 MOST_FRAMES = 64
+BUFFER = "replay_buffer.npz"
 
 
 class Dream(NamedTuple):
@@ -79,7 +80,7 @@ def watch(run_folder: str | Path, episodes: int = 2, context: int = 5, frames: i
     """
     Draw what the world model of a run believes it would see.
 
-    :param run_folder: of a run, with ``challenger.pt`` and ``replay_buffer.pkl``
+    :param run_folder: of a run, with ``challenger.pt`` and ``replay_buffer.npz``, neither of which can execute anything
     :param episodes: how many episodes, spread over the replay buffer, the newest first
     :param context: states that the model is shown at first
     :param frames: states in all, 16 to 64; episodes may be shorter
@@ -107,13 +108,19 @@ def check_frames(context: int, frames: int) -> None:
 def _load(folder: Path, device: str) -> tuple[Challenger, CPMBuffer]:
     if not folder.is_dir():
         raise ValueError(f"There is no run folder {folder}: expected one that `sb3_cpm train` left")
-    for name in ("challenger.pt", "replay_buffer.pkl"):
+    for name in ("challenger.pt", BUFFER):
+        if name == BUFFER and not (folder / name).is_file() and (folder / "replay_buffer.pkl").is_file():
+            raise ValueError(
+                f"{folder} is of an earlier version, which pickled its replay buffer, and a pickle can execute anything when "
+                f"it is read. If you trust it: python -c \"from sb3_cpm import CPMBuffer; CPMBuffer.load('{folder}/"
+                f"replay_buffer.pkl', allow_pickle=True).save('{folder}/{BUFFER}')\""
+            )
         if not (folder / name).is_file():
             raise ValueError(
                 f"{folder} has no {name}: `watch` needs the folder of a run that has ended, and whose challenger was trained"
             )
     challenger = Challenger.load(folder / "challenger.pt", device)
-    buffer = CPMBuffer.load(folder / "replay_buffer.pkl")
+    buffer = CPMBuffer.load(folder / BUFFER)
     missing = [key for key in challenger.keys if key not in buffer.observations]
     if missing:
         raise ValueError(f"The challenger reads {list(challenger.keys)}, the replay buffer of {folder} lacks {missing}")
@@ -184,8 +191,7 @@ def _write(folder: Path, challenger: Challenger, dreams: Sequence[Dream]) -> lis
         pictures.draw_strip(files[-1], dream, f"{title}, {dream.name}")
         if dream.images:
             files.append(target / f"open_loop_{number}.gif")
-            with atomic(files[-1]) as temporary:
-                temporary.write_bytes(pictures.animation(dream))
+            write_bytes(files[-1], pictures.animation(dream))
     files.append(target / "training.png")
     pictures.draw_training(files[-1], read_csv(folder / "progress.csv"), title)
     _log(folder / "tensorboard" / "watch", challenger, dreams, files)

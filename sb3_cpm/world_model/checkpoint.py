@@ -1,54 +1,61 @@
-"""One file per challenger: replaced only by a complete one, read without executing anything in it."""
+"""One file per challenger: whole or not written, checked before it is read, and read without executing anything in it."""
 
 import io
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from sb3_cpm.files import DamagedFileError, first_not_finite, verify, write_sealed
+
 FILE_FORMAT = "sb3_cpm challenger"
-FILE_VERSION = 1
+#: 2: with a digest. 1, which is read as well, had none.
+FILE_VERSION = 2
 
 
 def write_file(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
     """
-    Write ``content`` beside the file and move it there when it is complete: a crash leaves the old file as it was.
-
     :param path: of the file; its folder is made if need be
     :param content: tensors and plain data
+    :raises NotWrittenError: if the disk does not take it; a file that is there already stays as it was
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = target.with_name(f"{target.name}.{os.getpid()}.tmp")
-    try:
-        with open(unfinished, "wb") as file:
-            torch.save({"format": FILE_FORMAT, "version": FILE_VERSION, **content}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(unfinished, target)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_sealed(path, partial(torch.save, {"format": FILE_FORMAT, "version": FILE_VERSION, **content}))
 
 
 def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     """
     Content of a saved challenger, checked.
 
-    :raises ValueError: for files that are missing, damaged or something else
+    :raises ValueError: for files that are missing, damaged or something else, and for weights that are not finite
     """
     if not Path(path).is_file():
         raise ValueError(f"There is no file {path}.")
+    has_digest = verify(path, "challenger")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # an unpickler that reads something else fails in any way there is
-        raise ValueError(f"{path} is damaged or no saved challenger ({type(error).__name__}: {error}).") from error
+        raise DamagedFileError(f"{path} is damaged or no saved challenger ({type(error).__name__}: {error}).") from error
     if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
-        raise ValueError(f"{path} is no saved challenger.")
-    if content.get("version") != FILE_VERSION:
-        raise ValueError(f"{path} has file version {content.get('version')}, this package reads {FILE_VERSION}.")
+        raise DamagedFileError(f"{path} is no saved challenger.")
+    version = content.get("version")
+    if version not in (1, FILE_VERSION):
+        raise ValueError(f"{path} has file version {version}, this package reads 1 to {FILE_VERSION}.")
+    if version == FILE_VERSION and not has_digest:
+        raise DamagedFileError(
+            f"{path} is damaged or was changed by others: it has no digest of its bytes. Take an earlier one."
+        )
+    broken = first_not_finite(state_to_check(content["state"]))
+    if broken is not None:
+        raise DamagedFileError(f"{path} holds a challenger whose weight {broken} is not finite. Take an earlier one.")
     return content
+
+
+def state_to_check(state: Mapping[str, Any]) -> dict[str, Any]:
+    """:return: what must be finite of a challenger's state: weights, and the optimizers' averages of their gradients"""
+    return {**state["networks"], "optimizers": state["optimizers"]}
 
 
 def check_storable(name: str, values: Mapping[str, Any]) -> None:
@@ -68,17 +75,6 @@ def check_storable(name: str, values: Mapping[str, Any]) -> None:
                 f"{name}[{key!r}] is of {type(value)}, which cannot be read from a saved challenger. Give numbers, strings, "
                 "tensors (torch.as_tensor(array)), or lists, tuples and dicts of them."
             ) from error
-
-
-def check_finite(path: str | os.PathLike, name: str, weights: Mapping[str, Any]) -> None:
-    """
-    :raises RuntimeError: naming the first weight that is not finite: a file with it would only replace a better one
-    """
-    for key, value in weights.items():
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            raise RuntimeError(
-                f"The challenger is not saved: its weight {name}.{key} is not finite. If {path} exists, it is kept as it was."
-            )
 
 
 def check_sizes(name: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> None:

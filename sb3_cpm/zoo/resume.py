@@ -3,7 +3,8 @@ Runs of rl_zoo3 that can be continued with ``-i``.
 
 Beside ``ENV.zip`` rl_zoo3 writes ``replay_buffer.pkl`` (with ``--save-replay-buffer``), which holds D, I, coefficients,
 tolerances and reward memory. We add ``challenger.pt``; beside a checkpoint ``rl_model_N_steps.zip`` (``--save-freq``) it is
-``rl_model_challenger_N_steps.pt``, and with ``--save-replay-buffer`` the buffer is brought up to date then too.
+``rl_model_challenger_N_steps.pt``, and with ``--save-replay-buffer`` the buffer is brought up to date then too. Models and
+buffers are rl_zoo3's to read: they are pickles, which can execute anything, so ``-i`` is for files that you trust.
 
 rl_zoo3 starts ``-i`` at step 0, so it would repeat the random actions of ``learning_starts``; here the count goes on. The
 continued run has a folder of its own; its ``evaluations.npz`` begins with those of the run that it continues. A buffer that is
@@ -27,6 +28,7 @@ from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.callbacks import ChallengerCallback
+from sb3_cpm.files import NotFiniteError, NotWrittenError, replacing
 
 CHALLENGER, BUFFER = "challenger.pt", "replay_buffer.pkl"
 
@@ -134,11 +136,13 @@ class _Checkpoints(BaseCallback):
     def _on_rollout_end(self) -> None:
         if self._due is None:
             return
-        _save_challengers(self.folder / f"rl_model_challenger_{self._due}_steps.pt", self.challengers)
-        if self.with_buffer and isinstance(self.model, OffPolicyAlgorithm):
-            unfinished = self.folder / f"unfinished_{BUFFER}"
-            self.model.save_replay_buffer(unfinished)
-            unfinished.replace(self.folder / BUFFER)
+        try:
+            _save_challengers(self.folder / f"rl_model_challenger_{self._due}_steps.pt", self.challengers)
+            if self.with_buffer and isinstance(self.model, OffPolicyAlgorithm):
+                with replacing(self.folder / BUFFER) as unfinished:
+                    self.model.save_replay_buffer(unfinished)
+        except (NotWrittenError, NotFiniteError) as error:
+            _say(f"WARNING: {error}. The run goes on, and tries again at the next checkpoint")
         self._due = None
 
 
