@@ -24,7 +24,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer
+from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger, choose_uncertainty
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
@@ -69,6 +69,7 @@ class ChallengerCallback(BaseCallback):
         training, for models that this cannot work with
     """
 
+    @names_checked()
     def __init__(
         self,
         preset: str | dict[str, Any] = "default",

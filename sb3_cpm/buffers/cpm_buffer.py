@@ -6,7 +6,7 @@ D is a ``HerReplayBuffer`` that stores every observation once and samples in tim
 part of D that is never overwritten.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
+from sb3_cpm.arguments import names_checked
 from sb3_cpm.buffers.checks import check_arguments, check_shares
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
@@ -30,6 +31,10 @@ from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 
 #: Key of ``infos[i]`` under which the exploration wrapper tells the action, within [-1, 1], that was really executed.
 EXECUTED_ACTION = "cpm_executed_action"
+
+ONE_STEP = (
+    "it has one-step returns only. Leave n_steps and gamma out of replay_buffer_kwargs, and n_steps at 1 in the algorithm."
+)
 
 
 class CPMBuffer(EpisodeBuffer):
@@ -49,7 +54,9 @@ class CPMBuffer(EpisodeBuffer):
     :param optimize_memory_usage: not needed, must be False
     :param handle_timeout_termination: bootstrap at time limits
     :param n_sampled_goal: number of hindsight transitions per real one in D's share of a batch. 0, the default, works on
-        environments without goals; ``HerReplayBuffer`` has 4
+        environments without goals; ``HerReplayBuffer`` has 4. Their rewards come from the environment's ``compute_reward``,
+        as in SB3: wrappers that scale or shape the rewards of ``step()`` do not reach them, and both kinds are mixed in every
+        batch. Scale in ``compute_reward``, too
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
     :param challenge_ratio: share of P's updates (``mix="batch"``) or of each batch (``mix="row"``) from I [4.3: 0.25]
@@ -77,6 +84,7 @@ class CPMBuffer(EpisodeBuffer):
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
+    @names_checked(n_steps=ONE_STEP, gamma=ONE_STEP)
     def __init__(
         self,
         buffer_size: int,
@@ -171,13 +179,19 @@ class CPMBuffer(EpisodeBuffer):
         obs: dict[str, np.ndarray],
         next_obs: dict[str, np.ndarray],
         action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
+        reward: np.ndarray | float,
+        done: np.ndarray | bool,
+        infos: Sequence[dict[str, Any]],
     ) -> None:
         """
         Store one transition per environment. ``infos[i]`` may name the action that was executed instead of ``action[i]``.
 
+        :param obs: observations, each of shape ``(n_envs, *observation_shape)``
+        :param next_obs: what they led to; the true last observation where an episode ends
+        :param action: within [-1, 1], as ``policy.scale_action()`` gives it, shape ``(n_envs, *action_shape)``
+        :param reward: shape ``(n_envs,)``; a number will do for one environment, and so for ``done`` and ``infos``
+        :param done: whether the episodes ended, shape ``(n_envs,)``
+        :param infos: one per environment
         :raises ValueError: if no challenger would ever fill I, an episode does not fit into the buffer, for wrong shapes,
             rewards that are not finite, values that compact storage cannot hold, a full disk; nothing is stored then
         """
@@ -186,8 +200,11 @@ class CPMBuffer(EpisodeBuffer):
                 f"CPMBuffer has challenge_ratio={self.challenge_ratio}, but nobody proposes challenges: pass "
                 "callback=ChallengerCallback() to learn() (a configuration of rl_zoo3 has the line `callback: "
                 "sb3_cpm.ChallengerCallback`), or replay_buffer_kwargs=dict(challenge_ratio=0) to use the buffer without "
-                "challenges."
+                "challenges. To fill it by hand before learn(), use add_demonstrations(), or set its challenge_ratio to 0 "
+                "meanwhile."
             )
+        if isinstance(infos, Mapping):
+            infos = [dict(infos)]
         action = _executed(action, infos)
         if self.stopwatch is None:
             super().add(obs, next_obs, action, reward, done, infos)

@@ -16,7 +16,7 @@ import os
 import pickle
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,18 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
 from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
-from sb3_cpm.buffers.checks import check_environment, check_spaces, checked_rewards, unreadable
+from sb3_cpm.buffers.checks import (
+    check_construction,
+    check_environment,
+    check_spaces,
+    checked_actions,
+    checked_dones,
+    checked_hindsight_rewards,
+    checked_infos,
+    checked_rewards,
+    compute_reward_failed,
+    unreadable,
+)
 from sb3_cpm.buffers.compact import StorageSpec, make_codecs
 from sb3_cpm.buffers.sequences import draw_starts, read_sequences
 from sb3_cpm.buffers.storage import Episode, NextObservationView, ObservationRing, Transitions
@@ -41,6 +52,11 @@ FORMAT = 2
 _VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 # Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
 _BOOKS = 3 * 4 + 2 * 8 + 4
+
+
+#: Key of ``infos[i]`` with the last observation of an episode as the environment gave it. What SB3 calls the
+#: ``terminal_observation`` has been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
+LAST_OBSERVATION = "cpm_last_observation"
 
 
 class EpisodeBuffer(HerReplayBuffer):
@@ -55,7 +71,8 @@ class EpisodeBuffer(HerReplayBuffer):
     :param n_envs: number of parallel environments
     :param optimize_memory_usage: not needed, must be False
     :param handle_timeout_termination: bootstrap at time limits
-    :param n_sampled_goal: number of hindsight transitions per real one; 0 works on environments without goals
+    :param n_sampled_goal: number of hindsight transitions per real one; 0 works on environments without goals. Their rewards
+        come from the environment's ``compute_reward``, see :class:`~sb3_cpm.buffers.CPMBuffer`
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
     :param storage_dtypes: see :class:`~sb3_cpm.buffers.CPMBuffer`
@@ -82,6 +99,7 @@ class EpisodeBuffer(HerReplayBuffer):
         player_keys: Sequence[str] | None = None,
     ):
         check_spaces(observation_space, n_sampled_goal, player_keys)
+        check_construction(buffer_size, n_envs, optimize_memory_usage, goal_selection_strategy)
         # The parent allocates two copies of the observations and a dict per transition: give it a single slot.
         super().__init__(
             n_envs,
@@ -163,21 +181,31 @@ class EpisodeBuffer(HerReplayBuffer):
         obs: dict[str, np.ndarray],
         next_obs: dict[str, np.ndarray],
         action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
+        reward: np.ndarray | float,
+        done: np.ndarray | bool,
+        infos: Sequence[dict[str, Any]],
     ) -> None:
         """
-        Store one transition per environment.
+        Store one transition per environment. ``infos[i]`` may have the last observation of an episode as the environment gave
+        it, see :data:`LAST_OBSERVATION`.
 
+        :param obs: observations, each of shape ``(n_envs, *observation_shape)``
+        :param next_obs: what they led to; the true last observation where an episode ends
+        :param action: within [-1, 1], as ``policy.scale_action()`` gives it, shape ``(n_envs, *action_shape)``
+        :param reward: shape ``(n_envs,)``; a number will do for one environment, and so for ``done`` and ``infos``
+        :param done: whether the episodes ended, shape ``(n_envs,)``
+        :param infos: one per environment
         :raises ValueError: if an episode does not fit into the buffer, for wrong shapes, rewards that are not finite, values
             that compact storage cannot hold, a full disk; nothing is stored then
         """
         ring, pos, n_envs = self.ring, self.pos, self.n_envs
         # whatever can fail comes before the first change
+        reward, done = checked_rewards(reward, n_envs), checked_dones(done, n_envs)
+        infos = checked_infos(infos, n_envs)
+        if done.any():
+            next_obs = _as_before_vec_normalize(next_obs, done, infos)
         encoded_next = ring.encode(next_obs)
-        reward = checked_rewards(reward, n_envs)
-        action = np.reshape(action, (n_envs, self.action_dim))
+        action = checked_actions(action, n_envs, self.action_space, self.action_dim)
         ring.final.reserve(2 * n_envs)
         encoded = None if ring.goes_on_with(obs) else ring.encode(obs)
         if encoded is not None:
@@ -390,10 +418,12 @@ class EpisodeBuffer(HerReplayBuffer):
         if self.env is None:
             raise ValueError("Hindsight goals need the environment to compute their rewards: call set_env(env) first")
         infos = copy.deepcopy(self.infos[rows, envs]) if self.copy_info_dict else [{}] * len(rows)
-        # all environments are taken to be alike, as the parent does
-        return np.asarray(
-            self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])[0], dtype=np.float32
-        ).reshape(-1)
+        try:
+            # all environments are taken to be alike, as the parent does
+            rewards = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])[0]
+        except Exception as error:  # it is the user's
+            raise compute_reward_failed(len(rows), error) from error
+        return checked_hindsight_rewards(rewards, len(rows))
 
     def _get_real_samples(
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
@@ -558,3 +588,19 @@ class EpisodeBuffer(HerReplayBuffer):
             )
         super().__setstate__(state)
         self._link_views()
+
+
+def _as_before_vec_normalize(
+    next_obs: dict[str, np.ndarray], done: np.ndarray, infos: Sequence[dict[str, Any]]
+) -> dict[str, np.ndarray]:
+    """:return: the next observations, with the last one of an episode as the environment gave it where that is known"""
+    copied = False
+    for env_idx in np.flatnonzero(done).tolist():
+        last = infos[env_idx].get(LAST_OBSERVATION)
+        if last is None:
+            continue
+        if not copied:
+            next_obs, copied = {key: np.array(array) for key, array in next_obs.items()}, True
+        for key, array in next_obs.items():
+            array[env_idx] = last[key] if isinstance(last, Mapping) else last  # of a Box there is but one
+    return next_obs
