@@ -20,8 +20,8 @@ def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_ke
     if not isinstance(observation_space, spaces.Dict):
         raise ValueError(
             f"CPMBuffer needs a Dict observation space, got {observation_space}. Wrap the environment in "
-            'sb3_cpm.envs.DictObservation(env) and use "MultiInputPolicy" (SAC, TD3, DDPG and TQC have one, and so have all of '
-            "SBX's; sb3-contrib's CrossQ has none)."
+            'sb3_cpm.envs.DictObservation(env) and use "MultiInputPolicy" (SAC, TD3, DDPG, TQC and all of SBX have one, '
+            "sb3-contrib's CrossQ has none)."
         )
     if not observation_space.spaces:
         raise ValueError("The observation space is a Dict without keys: there is nothing to learn from.")
@@ -205,9 +205,9 @@ def checked_hindsight_rewards(rewards: Any, n: int) -> np.ndarray:
         raise ValueError(f"compute_reward must return {n} numbers for a batch of {n} goals, got {rewards!r:.100}.") from error
     if array.shape not in ((n,), (n, 1)) and not (n == 1 and array.size == 1):
         raise ValueError(
-            f"compute_reward returned shape {array.shape} for a batch of {n} pairs of goals. It must return one reward per row, "
-            f"shape ({n},): compute along the last axis, as np.linalg.norm(achieved_goal - desired_goal, axis=-1), and compare "
-            "with np.where(...) instead of if."
+            f"compute_reward returned shape {array.shape} for a batch of {n} pairs of goals. It must return one reward per "
+            f"row, shape ({n},): compute along the last axis, as np.linalg.norm(achieved_goal - desired_goal, axis=-1), and "
+            "compare with np.where(...) instead of if."
         )
     broken = np.flatnonzero(~np.isfinite(array.reshape(-1)))
     if len(broken):

@@ -81,9 +81,9 @@ class Codec:
         lost = cast != given if self.dtype.kind != "f" else np.isinf(cast) & np.isfinite(given)
         if lost.any():
             raise ValueError(
-                f"Observation {self.key!r} holds {given[lost][0]!s} ({given.dtype}), its space declares {self.dtype}, which has "
-                "no such number. Has a wrapper scaled it? Declare in the space what the environment returns (gymnasium.wrappers."
-                "TransformObservation), or give what the space says."
+                f"Observation {self.key!r} holds {given[lost][0]!s} ({given.dtype}), its space declares {self.dtype}, which "
+                "has no such number. Has a wrapper scaled it? Declare in the space what the environment returns "
+                "(gymnasium.wrappers.TransformObservation), or give what the space says."
             )
         return cast
 
@@ -92,8 +92,8 @@ def _cure(given: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     """What to do about a shape, where it looks like one of the usual slips."""
     if len(wanted) == 4 and given == (wanted[0], *wanted[2:], wanted[1]):
         return (
-            " Its channels come last, and SB3 puts them first (VecTransposeImage around the model's environment): transpose it, "
-            "image.transpose(2, 0, 1). Beside VecNormalize, make it VecNormalize(VecTransposeImage(env))."
+            " Its channels come last, and SB3 puts them first (VecTransposeImage around the model's environment): transpose "
+            "it, image.transpose(2, 0, 1). Beside VecNormalize, make it VecNormalize(VecTransposeImage(env))."
         )
     if given == wanted[1:]:
         return f" It lacks the first dimension, the {wanted[0]} environment{'s' if wanted[0] > 1 else ''}: observation[None]."

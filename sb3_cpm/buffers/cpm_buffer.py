@@ -376,7 +376,8 @@ class CPMBuffer(EpisodeBuffer):
 
     def add_demonstrations(self, source: str | Path | Sequence[Demonstration], env: Any = None) -> int:
         """
-        Add recorded episodes. They are never overwritten, and are sampled with ``demonstration_ratio``.
+        Add recorded episodes. They are never overwritten, and are sampled with ``demonstration_ratio``. Actions outside of
+        their bounds are clipped, as environments do with them, and a warning counts them.
 
         :param source: ManiSkill's trajectory file (``.h5``, with the ``.json`` of the same name beside it), or episodes
         :param env: a single environment, as made for training, in which the recorded actions are replayed; needed unless the
@@ -388,9 +389,11 @@ class CPMBuffer(EpisodeBuffer):
         check_shares(self.challenge_ratio, self.demonstration_ratio)
         if isinstance(source, (str, Path)):
             source = read_demonstrations(source, self.observation_space, self.action_space, env)
+        if isinstance(source, Demonstration):
+            source = [source]
         if not source:
-            raise ValueError("No demonstrations given")
-        steps = [step for episode in source for step in as_transitions(episode, self.observation_space, self.action_space)]
+            raise ValueError("No demonstrations given: `source` is a list of Demonstrations, or the path of ManiSkill's .h5.")
+        steps = as_transitions(source, self.observation_space, self.action_space)
         earlier = self.demonstrations
         n_earlier = 0 if earlier is None else earlier.size()
         grown = EpisodeBuffer(
