@@ -33,7 +33,7 @@ from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
-from sb3_cpm.world_model.observations import unread
+from sb3_cpm.world_model.observations import how_to_be_read, unread
 
 
 class ChallengerCallback(BaseCallback):
@@ -120,6 +120,7 @@ class ChallengerCallback(BaseCallback):
         self._previous_sigint: Any = None
         self._learn_started = 0.0
         self._next_training = 0
+        self._told_unread = False
 
     # ------------------------------------------------------------------ public
 
@@ -193,7 +194,7 @@ class ChallengerCallback(BaseCallback):
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
-            self._warn_of_unread_keys(buffer.player_keys)
+        self._warn_of_unread_keys(buffer.player_keys)
         for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
             if d is not None:
                 d.env = env
@@ -224,16 +225,22 @@ class ChallengerCallback(BaseCallback):
         self._listen_for_ctrl_c()
 
     def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
-        """Of a Dict that P and C share, each leaves out what the other may read; what neither does is lost."""
-        if player_keys is None or self.keys is not None:  # P reads everything, or the user has chosen
+        """
+        Of a Dict that P and C share, each leaves out what the other may read. What neither does is lost; and what P reads but
+        C cannot plays no role for what is new.
+        """
+        if self.keys is not None or self._told_unread:  # the user has chosen, or knows
             return
+        self._told_unread = True
         assert self.challenger is not None
-        for key, space in unread(self.challenger.observation_space, (*player_keys, *self.challenger.keys)).items():
-            warnings.warn(
-                f"Neither player nor challenger reads {key!r} ({space}). Let a wrapper make it a vector (a 1-D Box; "
-                "one-hot for Discrete), or take MultiInputPolicy, which reads it.",
-                stacklevel=2,
-            )
+        for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
+            if player_keys is None or key in player_keys:
+                what = f"The challenger cannot read {key!r} ({space}), so for it no state is new because of that."
+                cure = how_to_be_read(space)
+            else:
+                what = f"Neither player nor challenger reads {key!r} ({space})."
+                cure = f"{how_to_be_read(space)} Or take MultiInputPolicy, which reads it."
+            warnings.warn(f"{what} {cure} To say nothing of it, name the `keys` to read.", stacklevel=2)
 
     def _on_rollout_start(self) -> None:
         self.stopwatch.stop("P trains")
@@ -454,8 +461,8 @@ def _check_model(model: Any) -> None:
     if not isinstance(model.observation_space, spaces.Dict):
         raise ValueError(
             f"ChallengerCallback needs a Dict observation space, got {model.observation_space}. Wrap the environment in "
-            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...); CrossQ has no such policy, SAC, TD3, '
-            "DDPG and TQC do."
+            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...): SAC, TD3, DDPG, TQC and all of SBX '
+            "have such a policy, sb3-contrib's CrossQ has none."
         )
     if not isinstance(model.action_space, spaces.Box):
         raise ValueError(f"ChallengerCallback needs continuous actions (a Box action space), got {model.action_space}")

@@ -37,7 +37,7 @@ from sb3_cpm.dreamer.start import StartFrom, read_challenger, take_over_uncertai
 from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import check_finite
-from sb3_cpm.world_model.observations import check_action_space, unread
+from sb3_cpm.world_model.observations import check_action_space, how_to_be_read, unread
 
 #: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
 _OF_CONSTRUCTOR = ("preset", "keys", "start_from", "uncertainty_class", "uncertainty_kwargs", "train_task_behavior")
@@ -149,8 +149,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """Beside a player the challenger may leave things out; here nobody else reads them."""
         for key, space in unread(as_dict_space(self.observation_space), self.challenger.keys).items():
             warnings.warn(
-                f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
-                "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
+                f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). {how_to_be_read(space)} "
+                "To say nothing of it, name the `keys` to read.",
                 stacklevel=4,
             )
 
