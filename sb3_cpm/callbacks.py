@@ -198,6 +198,10 @@ class ChallengerCallback(BaseCallback):
         for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
             if d is not None:
                 d.env = env
+        # somebody may have evaluated in the environment since an earlier learn(); at a new beginning SB3 has reset it
+        earlier = self._env
+        moved = earlier is not None and earlier.unwrapped is env.unwrapped and earlier.moved
+        moved = moved and not self.locals["reset_num_timesteps"]
         last_obs = model._last_obs if model._vec_normalize_env is None else model._last_original_obs
         self._env = ExplorationVecEnv(
             env,
@@ -208,7 +212,9 @@ class ChallengerCallback(BaseCallback):
             self.segment_length,
             self.stopwatch,
             on_failure=self._detach,
+            on_moved=self._begin_anew,
         )
+        self._env.moved = moved
         model.env = self._env
         self._learn_started = model.start_time
         buffer.has_challenger = self._is_running
@@ -357,6 +363,18 @@ class ChallengerCallback(BaseCallback):
     def _is_running(self) -> bool:
         """Whether ``learn()`` is still the one that this callback was given to: an exception ends that without telling us."""
         return self.model.start_time == self._learn_started
+
+    def _begin_anew(self) -> None:
+        """
+        Somebody has used the training environment, to evaluate in it, say: SB3 would take what comes next for the
+        continuation of what it saw last. D ends the running episodes there, as it finds that they are not gone on with.
+        """
+        model = self.model
+        assert self._env is not None
+        model._last_obs = self._env.reset()  # type: ignore[assignment]
+        model._last_episode_starts = np.ones(self._env.num_envs, dtype=bool)
+        if model._vec_normalize_env is not None:
+            model._last_original_obs = model._vec_normalize_env.get_original_obs()
 
     def _detach(self) -> None:
         """Take the wrapper off the model's environment. Harmless when it is not there."""

@@ -54,9 +54,11 @@ _VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "
 _BOOKS = 3 * 4 + 2 * 8 + 4
 
 
-#: Key of ``infos[i]`` with the last observation of an episode as the environment gave it. What SB3 calls the
-#: ``terminal_observation`` has been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
-LAST_OBSERVATION = "cpm_last_observation"
+#: Key of ``infos[i]`` with the next observation as the environment gave it. What SB3 calls the ``terminal_observation`` has
+#: been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
+NEXT_OBSERVATION = "cpm_next_observation"
+#: Key of ``infos[i]`` with the reward as the environment gave it, where SB3 has another one by mistake.
+REWARD = "cpm_reward"
 
 
 class EpisodeBuffer(HerReplayBuffer):
@@ -186,8 +188,8 @@ class EpisodeBuffer(HerReplayBuffer):
         infos: Sequence[dict[str, Any]],
     ) -> None:
         """
-        Store one transition per environment. ``infos[i]`` may have the last observation of an episode as the environment gave
-        it, see :data:`LAST_OBSERVATION`.
+        Store one transition per environment. ``infos[i]`` may have next observation and reward as the environment gave
+        them, see :data:`NEXT_OBSERVATION` and :data:`REWARD`.
 
         :param obs: observations, each of shape ``(n_envs, *observation_shape)``
         :param next_obs: what they led to; the true last observation where an episode ends
@@ -200,10 +202,9 @@ class EpisodeBuffer(HerReplayBuffer):
         """
         ring, pos, n_envs = self.ring, self.pos, self.n_envs
         # whatever can fail comes before the first change
-        reward, done = checked_rewards(reward, n_envs), checked_dones(done, n_envs)
         infos = checked_infos(infos, n_envs)
-        if done.any():
-            next_obs = _as_before_vec_normalize(next_obs, done, infos)
+        next_obs, reward = _as_the_environment_gave(next_obs, reward, infos)
+        reward, done = checked_rewards(reward, n_envs), checked_dones(done, n_envs)
         encoded_next = ring.encode(next_obs)
         action = checked_actions(action, n_envs, self.action_space, self.action_dim)
         ring.final.reserve(2 * n_envs)
@@ -590,17 +591,17 @@ class EpisodeBuffer(HerReplayBuffer):
         self._link_views()
 
 
-def _as_before_vec_normalize(
-    next_obs: dict[str, np.ndarray], done: np.ndarray, infos: Sequence[dict[str, Any]]
-) -> dict[str, np.ndarray]:
-    """:return: the next observations, with the last one of an episode as the environment gave it where that is known"""
+def _as_the_environment_gave(next_obs: Any, reward: Any, infos: Sequence[Mapping[str, Any]]) -> tuple[Any, Any]:
+    """:return: next observations and rewards, with those of the infos in place of what SB3 has for them"""
     copied = False
-    for env_idx in np.flatnonzero(done).tolist():
-        last = infos[env_idx].get(LAST_OBSERVATION)
-        if last is None:
-            continue
-        if not copied:
-            next_obs, copied = {key: np.array(array) for key, array in next_obs.items()}, True
-        for key, array in next_obs.items():
-            array[env_idx] = last[key] if isinstance(last, Mapping) else last  # of a Box there is but one
-    return next_obs
+    for env_idx, info in enumerate(infos):
+        if NEXT_OBSERVATION in info:
+            true = info[NEXT_OBSERVATION]
+            if not copied:
+                next_obs, copied = {key: np.array(array) for key, array in next_obs.items()}, True
+            for key, array in next_obs.items():
+                array[env_idx] = true[key] if isinstance(true, Mapping) else true  # of a Box there is but one
+        if REWARD in info:
+            reward = np.array(reward)
+            reward[env_idx] = info[REWARD]
+    return next_obs, reward
