@@ -131,7 +131,8 @@ def argument_names(taker: Callable[..., Any]) -> set[str] | None:
     names: set[str] = set()
     for function in functions:
         parameters = inspect.signature(function).parameters.values()
-        names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD} - {"self"}
+        collecting = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        names |= {parameter.name for parameter in parameters if parameter.kind not in collecting} - {"self"}
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return names
     return None

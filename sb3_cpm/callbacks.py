@@ -35,6 +35,11 @@ from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
 from sb3_cpm.world_model.observations import how_to_be_read, unread
 
+_PARENTHESES = (
+    "The callback is the class ChallengerCallback instead of one of its kind: write learn(..., "
+    "callback=ChallengerCallback()), with parentheses."
+)
+
 
 class ChallengerCallback(BaseCallback):
     """
@@ -88,6 +93,8 @@ class ChallengerCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
+        if isinstance(keys, Mapping) and isinstance(preset, Mapping) and "self" in preset:  # SB3 calls it as a function
+            raise ValueError(_PARENTHESES)
         check("train_freq", train_freq, integer(1))
         check("gradient_steps", gradient_steps, integer(0))
         check("unit", unit, choice("step", "segment", "episode"))
@@ -154,6 +161,12 @@ class ChallengerCallback(BaseCallback):
         self.challenger.save(path)
 
     # ------------------------------------------------------------------ SB3's hooks
+
+    def init_callback(self, model: Any = None) -> None:
+        """As the parent's, which SB3 calls on whatever stands in a list of callbacks: on the class, ``self`` is the model."""
+        if not isinstance(self, ChallengerCallback):
+            raise ValueError(_PARENTHESES)
+        super().init_callback(model)
 
     def _init_callback(self) -> None:
         model = self.model
@@ -528,10 +541,16 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
         return
     needed = longest * model.n_envs
     if model.learning_starts - model.num_timesteps < needed:
+        if model.num_timesteps:
+            raise ValueError(
+                f"The model has made {model.num_timesteps} steps, but its replay buffer has no complete episode: that is in a "
+                "file of its own. Call model.load_replay_buffer(path) before learn(), with what "
+                "model.save_replay_buffer(path) saved; or begin with new experience: learning_starts="
+                f"{model.num_timesteps + needed} (it counts from the first step, and episodes last up to {longest} steps)."
+            )
         raise ValueError(
             f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps "
-            f"in each of {model.n_envs} environments. Set learning_starts={model.num_timesteps + needed} or more"
-            + (", or go on with the buffer that load_replay_buffer() loads." if model.num_timesteps else ".")
+            f"in each of {model.n_envs} environments. Set learning_starts={needed} or more."
         )
     if model.buffer_size < 2 * needed:
         raise ValueError(

@@ -1,5 +1,6 @@
 """What a :class:`~sb3_cpm.buffers.CPMBuffer` cannot work with, said in words."""
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,9 +8,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
 
 from sb3_cpm.arguments import AT_LEAST_0, SHARE, check, check_each, integer, nearest
+from sb3_cpm.spaces import is_cloud, is_vector
 
 #: Arguments that SB3's algorithms give to their replay buffer themselves.
 SET_BY_ALGORITHMS = ("buffer_size", "observation_space", "action_space", "env", "device", "n_envs", "optimize_memory_usage")
@@ -49,6 +54,50 @@ def _check_part(key: str, space: spaces.Space) -> None:
         )
     if isinstance(space, spaces.MultiDiscrete) and len(space.shape) > 1:
         raise ValueError(f"Observation {key!r} is {space}: SB3 takes MultiDiscrete of one dimension only. Flatten it.")
+
+
+#: Pixels per side that SB3's NatureCNN needs at least; its three convolutions leave 1x1 of them.
+NATURE_CNN_NEEDS = 36
+
+
+def check_player_reads_images(observation_space: spaces.Dict) -> None:
+    """
+    SB3's algorithms make their buffer first and tell it nothing of the policy, which then fails in torch's words where an
+    image is too small for it. So the model is looked for among those who are calling.
+
+    :raises ValueError: if SB3's own features extractor is about to be made for images that it cannot read
+    """
+    frame = inspect.currentframe()
+    while frame is not None and not (
+        frame.f_code.co_name == "_setup_model" and isinstance(frame.f_locals.get("self"), OffPolicyAlgorithm)
+    ):
+        frame = frame.f_back
+    if frame is None:
+        return
+    model = frame.f_locals["self"]
+    given = model.policy_kwargs or {}
+    default = inspect.signature(model.policy_class).parameters.get("features_extractor_class")
+    extractor = given.get("features_extractor_class") or (default and default.default)
+    if not (isinstance(extractor, type) and issubclass(extractor, CombinedExtractor)):
+        return
+    small = {
+        key: space.shape
+        for key, space in observation_space.spaces.items()
+        if is_image_space(space, normalized_image=not given.get("normalize_images", True))
+        and sorted(space.shape)[1] < NATURE_CNN_NEEDS  # type: ignore[arg-type]  # the smallest is the channels
+    }
+    if small:
+        keys = [
+            key
+            for key, space in observation_space.spaces.items()
+            if is_vector(space) or is_cloud(space) or is_image_space(space)
+        ]
+        raise ValueError(
+            f"SB3's {extractor.__name__} reads images of {NATURE_CNN_NEEDS}x{NATURE_CNN_NEEDS} pixels and more, these have "
+            f"{small}. Render them larger, or read them with policy_kwargs=dict(features_extractor_class=sb3_cpm."
+            f"PointNetExtractor, features_extractor_kwargs=dict(keys={keys})), or leave them to the challenger with the same "
+            "class and no `keys`."
+        )
 
 
 def check_construction(buffer_size: int, n_envs: int, optimize_memory_usage: bool, strategy: Any) -> None:

@@ -6,7 +6,7 @@ D is a ``HerReplayBuffer`` that stores every observation once and samples in tim
 part of D that is never overwritten.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from sb3_cpm.arguments import names_checked
-from sb3_cpm.buffers.checks import check_arguments, check_shares
+from sb3_cpm.buffers.checks import check_arguments, check_shares, checked_infos
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
@@ -181,7 +181,7 @@ class CPMBuffer(EpisodeBuffer):
         action: np.ndarray,
         reward: np.ndarray | float,
         done: np.ndarray | bool,
-        infos: Sequence[dict[str, Any]],
+        infos: Sequence[dict[str, Any]] | dict[str, Any],
     ) -> None:
         """
         Store one transition per environment. ``infos[i]`` may name the action that was executed instead of ``action[i]``.
@@ -203,8 +203,7 @@ class CPMBuffer(EpisodeBuffer):
                 "challenges. To fill it by hand before learn(), use add_demonstrations(), or set its challenge_ratio to 0 "
                 "meanwhile."
             )
-        if isinstance(infos, Mapping):
-            infos = [dict(infos)]
+        infos = checked_infos(infos, self.n_envs)
         action = _executed(action, infos)
         if self.stopwatch is None:
             super().add(obs, next_obs, action, reward, done, infos)

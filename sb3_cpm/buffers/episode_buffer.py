@@ -33,6 +33,7 @@ from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
 from sb3_cpm.buffers.checks import (
     check_construction,
     check_environment,
+    check_player_reads_images,
     check_spaces,
     checked_actions,
     checked_dones,
@@ -101,6 +102,7 @@ class EpisodeBuffer(HerReplayBuffer):
         player_keys: Sequence[str] | None = None,
     ):
         check_spaces(observation_space, n_sampled_goal, player_keys)
+        check_player_reads_images(observation_space)
         check_construction(buffer_size, n_envs, optimize_memory_usage, goal_selection_strategy)
         # The parent allocates two copies of the observations and a dict per transition: give it a single slot.
         super().__init__(
@@ -185,7 +187,7 @@ class EpisodeBuffer(HerReplayBuffer):
         action: np.ndarray,
         reward: np.ndarray | float,
         done: np.ndarray | bool,
-        infos: Sequence[dict[str, Any]],
+        infos: Sequence[dict[str, Any]] | dict[str, Any],
     ) -> None:
         """
         Store one transition per environment. ``infos[i]`` may have next observation and reward as the environment gave
@@ -317,7 +319,8 @@ class EpisodeBuffer(HerReplayBuffer):
             raise RuntimeError(
                 "Unable to sample before the end of the first episode: there is no complete one among the last "
                 f"{self.size() * self.n_envs} transitions. Set learning_starts to more than n_envs x the longest episode, "
-                "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit)."
+                "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit). A model that was "
+                "loaded needs its replay buffer too: model.load_replay_buffer(path)."
             )
 
     def _uniform_transitions(self, n: int, n_virtual: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import io
 import os
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,11 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     """
     if not Path(path).is_file():
         raise ValueError(f"There is no file {path}.")
+    if is_model(path):
+        raise ValueError(
+            f"{path} is a model that SB3 has saved; the challenger has a file of its own, which ChallengerCallback.save(path) "
+            "writes (rl_zoo3 with sb3_cpm.zoo and `sb3-cpm train` write it beside the model)."
+        )
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # an unpickler that reads something else fails in any way there is
@@ -49,6 +55,14 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     if content.get("version") != FILE_VERSION:
         raise ValueError(f"{path} has file version {content.get('version')}, this package reads {FILE_VERSION}.")
     return content
+
+
+def is_model(path: str | os.PathLike) -> bool:
+    """Whether a file is a model of SB3. torch's own files are zip archives too, with other members."""
+    if not Path(path).is_file() or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"data", "policy.pth"} <= set(archive.namelist())
 
 
 def check_storable(name: str, values: Mapping[str, Any]) -> None:
