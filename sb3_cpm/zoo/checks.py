@@ -191,10 +191,13 @@ def _check_numbers(hyperparameters: Mapping[str, Any], where: str) -> None:
     :raises ValueError: for numbers that YAML takes for text, at any depth, and for those that no algorithm can work with
     """
     for key, value in hyperparameters.items():
-        if key in NUMBERS and value is not None:
-            check(f"{where}: {key}", value, NUMBERS[key])
-        elif isinstance(value, str) and _is_number(value):
-            check(f"{where}: {key}", value, number("a number", lambda value: True))
+        rule = NUMBERS.get(key)
+        if isinstance(value, str) and _is_number(value):
+            whole = rule is not None and not rule.holds(0.5)
+            words = "a number" if rule is None else rule.words
+            check(f"{where}: {key}", value, Rule(words, lambda value: isinstance(value, int if whole else float)))  # noqa: B023
+        elif rule is not None and value is not None:
+            check(f"{where}: {key}", value, rule)
         else:
             _check_nested(f"{where}: {key}", value)
 
