@@ -68,6 +68,9 @@ $(VENV)/bin/python:
 
 $(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
 	@echo "==> Installing sb3_cpm[$(EXTRAS)] with the versions of constraints.txt (about 3 minutes)"
+	@# MuJoCo 4, which constraints.txt once named, leaves files of its parts in the folder of an earlier release
+	@if $(BIN)python -m pip show -q mujoco-core 2>/dev/null; then \
+		$(BIN)python -m pip uninstall -q -y mujoco mujoco-core mujoco-studio; fi
 	@$(BIN)python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 

@@ -5,11 +5,12 @@ syntax error, and are handed on from one constructor to the next.
 
 import contextlib
 import difflib
+import functools
 import inspect
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 # ---------------------------------------------------------------------- values
 
@@ -71,7 +72,8 @@ def _how_to_write(value: Any, rule: Rule) -> str:
     with contextlib.suppress(ValueError, OverflowError):
         if isinstance(value, str) and (rule.holds(float(value)) or rule.holds(int(float(value)))):
             # YAML 1.1, which PyYAML reads, takes 1e-2 and 1.0e2 for text
-            return " That is text: leave quotes away, and give an exponent a point and a sign, as in 1.0e-2."
+            whole = "" if rule.holds(float(value)) else f"; a whole number has none: {int(float(value))}"
+            return f" That is text: leave quotes away, and give an exponent a point and a sign, as in 1.0e-2{whole}."
         if isinstance(value, float) and value.is_integer() and rule.holds(int(value)):
             return f" Write {int(value)}."
     return ""
@@ -86,17 +88,20 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.4) -> str:
     return f" Did you mean {matches[0]!r}?" if matches else ""
 
 
-def check_names(where: str, given: Any, valid: Iterable[str]) -> None:
+def check_names(where: str, given: Any, valid: Iterable[str], explained: Mapping[str, str] | None = None) -> None:
     """
     :param where: where they come from, for the message
     :param given: arguments by name
     :param valid: names that there are
+    :param explained: what to say of names that are no slips, but belong elsewhere
     :raises ValueError: for a name that is not among them, with the nearest; if ``given`` is no mapping
     """
     if not isinstance(given, Mapping):
         raise ValueError(f"{where} must be arguments by name (a mapping), got {given!r}.")
     valid = sorted(valid)
     for key in given:
+        if key in (explained or {}):
+            raise ValueError(f"{where}: {explained[key]}")  # type: ignore[index]
         if key not in valid:
             raise ValueError(f"{where}: unknown key {key!r}.{nearest(str(key), valid)} Valid: {', '.join(valid)}.")
 
@@ -115,7 +120,7 @@ def check_arguments(where: str, given: Any, taker: Callable[..., Any], excluded:
     for key in excluded:
         if isinstance(given, Mapping) and key in given:
             raise ValueError(f"{where}: {key!r} is set elsewhere, leave it out here.")
-    check_names(where, given, valid - {*excluded})
+    check_names(where, given, valid - {*excluded}, getattr(getattr(taker, "__init__", None), "explained", None))
 
 
 def argument_names(taker: Callable[..., Any]) -> set[str] | None:
@@ -126,7 +131,8 @@ def argument_names(taker: Callable[..., Any]) -> set[str] | None:
     names: set[str] = set()
     for function in functions:
         parameters = inspect.signature(function).parameters.values()
-        names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD} - {"self"}
+        collecting = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        names |= {parameter.name for parameter in parameters if parameter.kind not in collecting} - {"self"}
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return names
     return None
@@ -143,3 +149,30 @@ def told_where(where: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def names_checked(**explained: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """
+    For constructors: an argument that there is not becomes a ValueError that names the nearest, which Python's TypeError does
+    not do.
+
+    :param explained: what to say of names that are no slips, but belong elsewhere
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        valid = set(inspect.signature(function).parameters) - {"self"}
+
+        @functools.wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            if not kwargs.keys() <= valid:
+                check_names(type(args[0]).__name__, kwargs, valid, explained)
+            return function(*args, **kwargs)
+
+        checked.explained = explained  # type: ignore[attr-defined]
+        return checked
+
+    return decorate

@@ -24,7 +24,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer
+from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger, choose_uncertainty
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
@@ -33,7 +33,12 @@ from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
-from sb3_cpm.world_model.observations import unread
+from sb3_cpm.world_model.observations import how_to_be_read, unread
+
+_PARENTHESES = (
+    "The callback is the class ChallengerCallback instead of one of its kind: write learn(..., "
+    "callback=ChallengerCallback()), with parentheses."
+)
 
 #: Episodes in a row that are too short for a challenge before that is said.
 MANY_SHORT = 10
@@ -77,6 +82,7 @@ class ChallengerCallback(BaseCallback):
         training, for models that this cannot work with
     """
 
+    @names_checked()
     def __init__(
         self,
         preset: str | dict[str, Any] = "default",
@@ -96,6 +102,8 @@ class ChallengerCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
+        if isinstance(keys, Mapping) and isinstance(preset, Mapping) and "self" in preset:  # SB3 calls it as a function
+            raise ValueError(_PARENTHESES)
         check("train_freq", train_freq, integer(1))
         check("gradient_steps", gradient_steps, integer(0))
         check("unit", unit, choice("step", "segment", "episode"))
@@ -134,6 +142,7 @@ class ChallengerCallback(BaseCallback):
         self._told_of_decay = False
         self._n_short = 0
         self._told_of_short = False
+        self._told_unread = False
 
     # ------------------------------------------------------------------ public
 
@@ -169,6 +178,12 @@ class ChallengerCallback(BaseCallback):
         self.challenger.save(path)
 
     # ------------------------------------------------------------------ SB3's hooks
+
+    def init_callback(self, model: Any = None) -> None:
+        """As the parent's, which SB3 calls on whatever stands in a list of callbacks: on the class, ``self`` is the model."""
+        if not isinstance(self, ChallengerCallback):
+            raise ValueError(_PARENTHESES)
+        super().init_callback(model)
 
     def _init_callback(self) -> None:
         model = self.model
@@ -210,10 +225,14 @@ class ChallengerCallback(BaseCallback):
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
             buffer.player_keys = _player_keys(model)
-            self._warn_of_unread_keys(buffer.player_keys)
+        self._warn_of_unread_keys(buffer.player_keys)
         for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
             if d is not None:
                 d.env = env
+        # somebody may have evaluated in the environment since an earlier learn(); at a new beginning SB3 has reset it
+        earlier = self._env
+        moved = earlier is not None and earlier.unwrapped is env.unwrapped and earlier.moved
+        moved = moved and not self.locals["reset_num_timesteps"]
         last_obs = model._last_obs if model._vec_normalize_env is None else model._last_original_obs
         self._env = ExplorationVecEnv(
             env,
@@ -224,7 +243,9 @@ class ChallengerCallback(BaseCallback):
             self.segment_length,
             self.stopwatch,
             on_failure=self._detach,
+            on_moved=self._begin_anew,
         )
+        self._env.moved = moved
         model.env = self._env
         self._learn_started = model.start_time
         buffer.has_challenger = self._is_running
@@ -256,16 +277,22 @@ class ChallengerCallback(BaseCallback):
             )
 
     def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
-        """Of a Dict that P and C share, each leaves out what the other may read; what neither does is lost."""
-        if player_keys is None or self.keys is not None:  # P reads everything, or the user has chosen
+        """
+        Of a Dict that P and C share, each leaves out what the other may read. What neither does is lost; and what P reads but
+        C cannot plays no role for what is new.
+        """
+        if self.keys is not None or self._told_unread:  # the user has chosen, or knows
             return
+        self._told_unread = True
         assert self.challenger is not None
-        for key, space in unread(self.challenger.observation_space, (*player_keys, *self.challenger.keys)).items():
-            warnings.warn(
-                f"Neither player nor challenger reads {key!r} ({space}). Let a wrapper make it a vector (a 1-D Box; "
-                "one-hot for Discrete), or take MultiInputPolicy, which reads it.",
-                stacklevel=2,
-            )
+        for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
+            if player_keys is None or key in player_keys:
+                what = f"The challenger cannot read {key!r} ({space}), so for it no state is new because of that."
+                cure = how_to_be_read(space)
+            else:
+                what = f"Neither player nor challenger reads {key!r} ({space})."
+                cure = f"{how_to_be_read(space)} Or take MultiInputPolicy, which reads it."
+            warnings.warn(f"{what} {cure} To say nothing of it, name the `keys` to read.", stacklevel=2)
 
     def _on_rollout_start(self) -> None:
         self.stopwatch.stop("P trains")
@@ -402,6 +429,18 @@ class ChallengerCallback(BaseCallback):
         """Whether ``learn()`` is still the one that this callback was given to: an exception ends that without telling us."""
         return self.model.start_time == self._learn_started
 
+    def _begin_anew(self) -> None:
+        """
+        Somebody has used the training environment, to evaluate in it, say: SB3 would take what comes next for the
+        continuation of what it saw last. D ends the running episodes there, as it finds that they are not gone on with.
+        """
+        model = self.model
+        assert self._env is not None
+        model._last_obs = self._env.reset()  # type: ignore[assignment]
+        model._last_episode_starts = np.ones(self._env.num_envs, dtype=bool)
+        if model._vec_normalize_env is not None:
+            model._last_original_obs = model._vec_normalize_env.get_original_obs()
+
     def _detach(self) -> None:
         """Take the wrapper off the model's environment. Harmless when it is not there."""
         for section in ("P trains", "P acts"):
@@ -505,8 +544,8 @@ def _check_model(model: Any) -> None:
     if not isinstance(model.observation_space, spaces.Dict):
         raise ValueError(
             f"ChallengerCallback needs a Dict observation space, got {model.observation_space}. Wrap the environment in "
-            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...); CrossQ has no such policy, SAC, TD3, '
-            "DDPG and TQC do."
+            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...): SAC, TD3, DDPG, TQC and all of SBX '
+            "have such a policy, sb3-contrib's CrossQ has none."
         )
     if not isinstance(model.action_space, spaces.Box):
         raise ValueError(f"ChallengerCallback needs continuous actions (a Box action space), got {model.action_space}")
@@ -554,10 +593,16 @@ def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
         return
     needed = longest * model.n_envs
     if model.learning_starts - model.num_timesteps < needed:
+        if model.num_timesteps:
+            raise ValueError(
+                f"The model has made {model.num_timesteps} steps, but its replay buffer has no complete episode: that is in a "
+                "file of its own. Call model.load_replay_buffer(path) before learn(), with what "
+                "model.save_replay_buffer(path) saved; or begin with new experience: learning_starts="
+                f"{model.num_timesteps + needed} (it counts from the first step, and episodes last up to {longest} steps)."
+            )
         raise ValueError(
             f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps "
-            f"in each of {model.n_envs} environments. Set learning_starts={model.num_timesteps + needed} or more"
-            + (", or go on with the buffer that load_replay_buffer() loads." if model.num_timesteps else ".")
+            f"in each of {model.n_envs} environments. Set learning_starts={needed} or more."
         )
     if model.buffer_size < 2 * needed:
         raise ValueError(

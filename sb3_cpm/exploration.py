@@ -15,13 +15,15 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_cpm.arguments import ABOVE_0, SHARE, check, check_each, nearest
 from sb3_cpm.buffers import EXECUTED_ACTION
+from sb3_cpm.buffers.episode_buffer import NEXT_OBSERVATION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 ExplorationUnit = Literal["step", "segment", "episode"]
@@ -86,7 +88,7 @@ class _Row(NamedTuple):
     is_first: bool
 
 
-class ExplorationVecEnv(VecEnvWrapper):
+class ExplorationVecEnv(WatchedVecEnv):
     """
     Replaces the player's actions by the challenger's with probability epsilon, while it is ``active``.
 
@@ -101,6 +103,8 @@ class ExplorationVecEnv(VecEnvWrapper):
     :param segment_length: number of steps in a segment
     :param stopwatch: charged with "simulate+render" and "C acts"
     :param on_failure: called when a step fails, before the exception goes on
+    :param on_moved: called before a step if somebody else has reset or stepped the environments, see
+        :class:`~sb3_cpm.training_env.WatchedVecEnv`; has to call :meth:`reset`
     """
 
     #: The latent state catches up after this many states at the latest, to bound memory.
@@ -116,6 +120,7 @@ class ExplorationVecEnv(VecEnvWrapper):
         segment_length: int = 20,
         stopwatch: Stopwatch | None = None,
         on_failure: Callable[[], None] = lambda: None,
+        on_moved: Callable[[], None] = lambda: None,
     ):
         super().__init__(venv)
         assert isinstance(self.action_space, spaces.Box)
@@ -126,12 +131,11 @@ class ExplorationVecEnv(VecEnvWrapper):
         self.segment_length = segment_length
         self.stopwatch = stopwatch or Stopwatch()
         self.on_failure = on_failure
+        self.on_moved = on_moved
         self.active = False
         #: Number of actions asked for while active, and how many of them the challenger gave.
         self.n_actions = self.n_explored = 0
 
-        # D holds observations as they were before VecNormalize, and so does C see them
-        self._vec_normalize = unwrap_vec_normalize(venv)
         self._latent = challenger.initial_state(self.num_envs)
         self._noise = CorrelatedNoise(challenger.preset["noise_memory"], challenger.action_dim, challenger.device)
         self._pending: list[list[_Row]] = [[] for _ in range(self.num_envs)]
@@ -143,7 +147,7 @@ class ExplorationVecEnv(VecEnvWrapper):
             self._start_episode(env_idx, last_obs)
 
     def reset(self) -> VecEnvObs:
-        obs = self.venv.reset()
+        obs = super().reset()
         original = self._original(obs)
         for env_idx in range(self.num_envs):
             self._start_episode(env_idx, original)
@@ -151,18 +155,20 @@ class ExplorationVecEnv(VecEnvWrapper):
 
     def step_async(self, actions: np.ndarray) -> None:
         try:
+            if self.moved:
+                self.on_moved()
             if self.active:
                 with self.stopwatch.section("C acts"):
                     actions = self._choose_actions(np.array(actions))
             self.stopwatch.start("simulate+render")
-            self.venv.step_async(actions)
+            super().step_async(actions)
         except BaseException:
             self.on_failure()
             raise
 
     def step_wait(self) -> VecEnvStepReturn:
         try:
-            obs, rewards, dones, infos = self.venv.step_wait()
+            obs, rewards, dones, infos = super().step_wait()
             self.stopwatch.stop("simulate+render")
             self._n_steps += 1
             if self.active:
@@ -170,7 +176,7 @@ class ExplorationVecEnv(VecEnvWrapper):
                 self._check_finite(original, rewards, dones, infos)
                 with self.stopwatch.section("C acts"):
                     self._follow(original, dones)
-                infos = self._report(infos)
+                self._report(infos)
             return obs, rewards, dones, infos
         except (EOFError, ConnectionError) as error:
             self.on_failure()
@@ -184,6 +190,7 @@ class ExplorationVecEnv(VecEnvWrapper):
             raise
 
     def _original(self, obs: VecEnvObs) -> dict[str, np.ndarray]:
+        """D holds observations as they were before VecNormalize, and so does C see them."""
         if self._vec_normalize is not None:
             obs = self._vec_normalize.get_original_obs()
         assert isinstance(obs, dict)
@@ -218,12 +225,11 @@ class ExplorationVecEnv(VecEnvWrapper):
         actions = self.challenger.act(self._latent.select(th.as_tensor(envs)), noise=self._noise.draw(envs))
         return actions.reshape(len(envs), *self._low.shape)
 
-    def _report(self, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """:return: the infos, with the action wherever C acted, in new dicts: environments may share theirs, or keep them"""
-        return [
-            {**info, EXECUTED_ACTION: executed.copy()} if explores else info
-            for info, executed, explores in zip(infos, self._executed, self._explores, strict=True)
-        ]
+    def _report(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Say in the infos which action was executed wherever C acted."""
+        for info, executed, explores in zip(infos, self._executed, self._explores, strict=True):
+            if explores:
+                info[EXECUTED_ACTION] = executed.copy()
 
     # ------------------------------------------------------------------ C's latent state
 
@@ -284,7 +290,8 @@ class ExplorationVecEnv(VecEnvWrapper):
                     f"Environment {env_idx} gave a reward of {rewards[env_idx]} at step {self._n_steps} of this learn(): "
                     "rewards must be finite. stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
                 )
-            last = infos[env_idx].get("terminal_observation") if dones[env_idx] else None
+            info = infos[env_idx]
+            last = info.get(NEXT_OBSERVATION, info.get("terminal_observation")) if dones[env_idx] else None
             for key, array in obs.items():
                 for raw in (array[env_idx],) if last is None else (array[env_idx], last[key]):
                     value = np.asarray(raw)  # the last observation is as the environment gave it: a number, a list

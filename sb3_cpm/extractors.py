@@ -6,6 +6,7 @@ cannot matter. The challenger looks at camera images, the player doesn't: keys t
 through the player's networks nor have to be in the batches that the player trains on.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import MultiInputPolicy
 from torch import nn
+
+from sb3_cpm.spaces import is_cloud, is_vector, looks_like_cloud
+
+SMALLEST_IMAGE = 14  # pixels per side; three strided convolutions leave 1x1
 
 
 class PointNet(nn.Module):
@@ -96,12 +101,18 @@ class ImageEncoder(nn.Module):
 
     :param space: the image's space, as SB3's ``VecEnv`` gives it
     :param size: size of the result
+    :raises ValueError: for smaller images
     """
 
     def __init__(self, space: spaces.Box, size: int = 64) -> None:
         super().__init__()
         self.channels_first = is_image_space_channels_first(space)
         channels = space.shape[0] if self.channels_first else space.shape[-1]
+        if min(space.shape[1:] if self.channels_first else space.shape[:-1]) < SMALLEST_IMAGE:
+            raise ValueError(
+                f"PointNetExtractor reads images of {SMALLEST_IMAGE}x{SMALLEST_IMAGE} pixels and more, not {space}. Let a "
+                "wrapper enlarge them (gymnasium.wrappers.ResizeObservation), or flatten them to vectors."
+            )
         self.cnn = nn.Sequential(
             nn.Conv2d(channels, 32, 4, stride=2),
             nn.ReLU(),
@@ -256,6 +267,13 @@ def _kinds_of_keys(space: spaces.Space, keys: Sequence[str] | None) -> dict[str,
     else:
         chosen = {key: kind for key, kind in kinds.items() if kind in ("cloud", "vector")}
         chosen = chosen or {key: kind for key, kind in kinds.items() if kind == "image"}
+        for key in (key for key, kind in chosen.items() if kind == "cloud" and not looks_like_cloud(space[key])):
+            warnings.warn(
+                f"PointNetExtractor reads {key!r} ({space[key]}) as a point cloud: the order of its rows is lost. If it is "
+                "something else (stacked states, say), flatten it (gymnasium.wrappers.FlattenObservation, before it goes into "
+                "the Dict); if it is a cloud, say so by naming all `keys`.",
+                stacklevel=3,
+            )
     if not chosen:
         raise ValueError(
             f"PointNetExtractor found neither a point cloud (2-D float Box) nor a vector (1-D Box) nor a uint8 image in "
@@ -273,8 +291,6 @@ def _box(space: spaces.Dict, key: str) -> spaces.Box:
 def _kind(space: spaces.Space) -> str:
     if is_image_space(space):
         return "image"
-    if isinstance(space, spaces.Box) and len(space.shape) == 2 and np.issubdtype(space.dtype, np.floating):
+    if is_cloud(space):
         return "cloud"
-    if isinstance(space, spaces.Box) and len(space.shape) == 1:
-        return "vector"
-    return "other"
+    return "vector" if is_vector(space) else "other"

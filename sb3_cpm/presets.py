@@ -183,6 +183,12 @@ def make_preset(preset: str | Mapping[str, Any] = "default", base: str = "defaul
     :raises ValueError: for unknown names (with the nearest valid one), and values that cannot work, saying what they must be
     """
     if isinstance(preset, str):
+        if preset not in PRESETS and preset in CHALLENGES:
+            raise ValueError(
+                f"{preset!r} is no preset of the challenger, it says what becomes of challenges: give it to the buffer, "
+                f"replay_buffer_kwargs=sb3_cpm.presets.CHALLENGES[{preset!r}] (in zoo_configs/ it is cpm_sac_{preset}.yml). "
+                f"Valid: {sorted(PRESETS)}."
+            )
         if preset not in PRESETS:
             raise ValueError(f"Unknown preset {preset!r}.{nearest(preset, PRESETS, cutoff=0.0)} Valid: {sorted(PRESETS)}.")
         result = dict(PRESETS[preset])

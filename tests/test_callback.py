@@ -629,8 +629,8 @@ def never_step(env):
     "make, message",
     [
         (lambda: make_model("Pendulum-v1", policy="MlpPolicy"), "sb3_cpm.envs.DictObservation"),
-        (lambda: CrossQ("MlpPolicy", "Pendulum-v1", replay_buffer_class=CPMBuffer), "CrossQ has none"),
-        (lambda: CrossQ("MlpPolicy", "Pendulum-v1").learn(10, callback=make_callback()), "CrossQ has no such policy"),
+        (lambda: CrossQ("MlpPolicy", "Pendulum-v1", replay_buffer_class=CPMBuffer), "sb3-contrib's CrossQ has none"),
+        (lambda: CrossQ("MlpPolicy", "Pendulum-v1").learn(10, callback=make_callback()), "sb3-contrib's CrossQ has none"),
         (lambda: DQN("MlpPolicy", "CartPole-v1").learn(10, callback=make_callback()), "Dict observation space"),
         (lambda: PPO("MultiInputPolicy", never_step(toy())).learn(10, callback=make_callback()), "off-policy"),
         (
@@ -740,8 +740,35 @@ def test_what_neither_player_nor_challenger_reads_is_told():
         make_model(env, policy=PointNetPolicy).learn(10, callback=make_callback())
     assert len(told) == 1  # neither the camera, which C reads, nor the point cloud, which P reads
     env = WithDiscrete(gym.make("CPMToy-v0", keys=("state",)))
-    make_model(env).learn(10, callback=make_callback())  # SB3's own policy reads everything
+    model, callback = make_model(env), make_callback()
+    with pytest.warns(UserWarning, match="challenger cannot read 'mode' .*Let a wrapper make it a vector"):
+        model.learn(10, callback=callback)  # SB3's own policy reads everything
+    model.learn(10, callback=callback)  # told once
     make_model(env, policy=PointNetPolicy).learn(10, callback=make_callback(keys=["state"]))
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-1, 1, (4, 3), np.float32),  # stacked states
+        spaces.Box(-1, 1, (2, 10), np.float64),
+        spaces.Box(0, 9, (3, 3), np.int64),
+        spaces.MultiBinary(4),
+        spaces.Box(0, 255, (2, 8, 8, 3), np.uint8),  # stacked images
+    ],
+)
+def test_what_the_challenger_cannot_read_is_told_beside_a_policy_that_reads_everything(space):
+    class With(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = spaces.Dict({**env.observation_space.spaces, "more": space})
+
+        def observation(self, observation):
+            return {**observation, "more": np.zeros(space.shape, space.dtype)}
+
+    with pytest.warns(UserWarning, match=r"(?s)challenger cannot read 'more'.*name the `keys` to read") as told:
+        make_model(With(gym.make("CPMToy-v0", keys=("state",)))).learn(4, callback=make_callback())
+    assert len(told) == 1
 
 
 def test_the_buffer_without_its_callback():

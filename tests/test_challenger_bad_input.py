@@ -141,14 +141,37 @@ def test_images_neither_uint8_nor_in_a_declared_range(bounds: tuple[float, float
         assert ObservationSpec(space).keys == ("state",)
 
 
-@pytest.mark.parametrize("size, layers", [(84, 2), (33, 0), (50, 1)])
-def test_sizes_that_the_cnn_cannot_divide(size: int, layers: int) -> None:
-    space = spaces.Dict({"camera": image(size)})
-    with pytest.raises(ValueError, match=rf"{size}x{size} pixels cannot be halved .* multiple of \d+ pixels") as told:
-        small(space)
-    assert (f"challenger_kwargs=dict(cnn_layers={layers})" in str(told.value)) == (layers > 0)
-    if layers:
-        small(space, cnn_layers=layers)
+@pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.int32, np.uint32, np.int64])
+@pytest.mark.parametrize("from_zero", [False, True])
+def test_integer_images_whose_bounds_are_the_limits_of_their_dtype(dtype: type, from_zero: bool) -> None:
+    """They tell nothing: depth in millimetres would be a thousandth of the range, colours less."""
+    limits = np.iinfo(dtype)
+    camera = spaces.Box(0 if from_zero else limits.min, limits.max, (32, 32, 3), dtype)
+    space = spaces.Dict({"camera": camera, "state": vector()})
+    with pytest.warns(UserWarning, match="leaves out 'camera'.*limits of its dtype are none.*declare the bounds"):
+        assert ObservationSpec(space).keys == ("state",)
+    with pytest.raises(ValueError, match="cannot read key 'camera'.*declare the bounds"):
+        ObservationSpec(space, ["camera", "state"])
+    declared = spaces.Dict({"camera": spaces.Box(0, 4000, (32, 32, 3), dtype)})
+    assert ObservationSpec(declared).ranges == {"camera": (0.0, 4000.0)}
+
+
+def test_eight_bits_are_a_range() -> None:
+    space = spaces.Dict({"camera": spaces.Box(-128, 127, (8, 8, 3), np.int8), "other": image(8)})
+    assert ObservationSpec(space).ranges == {"camera": (-128.0, 127.0), "other": (0.0, 255.0)}
+
+
+@pytest.mark.parametrize("size", [16, 23, 84])
+def test_images_of_any_size(size: int, tmp_path: pathlib.Path) -> None:
+    space = spaces.Dict({"camera": image(size), "state": vector()})
+    challenger, batch = small(space), random_batch(space, 2)
+    for _ in range(2):
+        before = challenger.train(batch)
+    challenger.save(tmp_path / "challenger.pt")
+    assert Challenger.load(tmp_path / "challenger.pt", "cpu").trained_updates == 2
+    assert np.isfinite(list(before.values())).all() and 0.0 < before["error_camera"] < 1.0
+    opened = challenger.open_loop({key: value[:, 0] for key, value in batch.observations.items()}, batch.actions[1:, 0], 3)
+    assert opened.observations["camera"].shape == (8, size, size, 3)
 
 
 # ---- numbers that are not finite ---------------------------------------------------------------------------------------

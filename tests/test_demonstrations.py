@@ -71,11 +71,11 @@ def test_actions_and_ends_are_stored_as_in_d():
 @pytest.mark.parametrize(
     "changes, message",
     [
-        (dict(rewards=np.zeros(0)), "no steps"),
+        (dict(rewards=np.zeros(0)), "at least one step"),
         (dict(rewards=np.array([1.0, np.nan, 1.0])), "finite"),
         (dict(actions=np.full((3, 1), 2.5)), "outside of"),
         (dict(actions=np.zeros((3, 2))), r"shape \(3, 2\)"),
-        (dict(observations={"state": np.zeros((3, 2))}), r"expected \(4, 2\)"),
+        (dict(observations={"state": np.zeros((3, 2))}), r"shape \(4, 2\).*got \(3, 2\)"),
         (dict(observations={"stat": np.zeros((4, 2))}), "lacks the observations"),
     ],
 )

@@ -124,7 +124,7 @@ def test_float16_clouds_through_preprocessing() -> None:
         (SPACE, {"keys": []}, "neither a point cloud"),
         (spaces.Dict({"button": spaces.Discrete(3)}), {"keys": ["button"]}, "clouds, vectors and images"),
         (SPACE, {"sizes": (0,)}, "at least one layer"),
-        (spaces.Dict({"flat": spaces.Box(-1, 1, (9, 2), np.float32)}), {"input_transform": True}, "x, y, z"),
+        (spaces.Dict({"flat": spaces.Box(-1, 1, (40, 2), np.float32)}), {"input_transform": True}, "x, y, z"),
     ],
 )
 def test_wrong_input(space: Any, kwargs: dict, message: str) -> None:
@@ -206,3 +206,20 @@ def test_extractor_is_fast_enough() -> None:
     for _ in range(5):
         extractor(observations).sum().backward()
     assert (time.process_time() - start) / 5 < 0.06
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (8, 5), (31, 3), (40, 1), (2, 84)])
+def test_stacked_states_are_told_from_clouds(shape: tuple[int, int]) -> None:
+    """As a set of points, the last states would look the same forwards and backwards in time."""
+    space = spaces.Dict({"stack": spaces.Box(-1, 1, shape), "state": spaces.Box(-1, 1, (2,))})
+    with pytest.warns(UserWarning, match="reads 'stack' .* as a point cloud: .*FlattenObservation.*naming all `keys`"):
+        PointNetExtractor(space)
+    assert PointNetExtractor(space, keys=["stack", "state"]).cloud_keys == ["stack"]  # the user has said so
+    PointNetExtractor(spaces.Dict({"cloud": spaces.Box(-1, 1, (32, 3)), "flat": spaces.Box(-1, 1, (64, 2))}))
+
+
+@pytest.mark.parametrize("size", [(13, 40), (40, 12)])
+def test_images_that_are_too_small(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="14x14 pixels and more.*ResizeObservation"):
+        PointNetExtractor(spaces.Dict({"camera": spaces.Box(0, 255, (*size, 3), np.uint8)}))
+    PointNetExtractor(spaces.Dict({"camera": spaces.Box(0, 255, (14, 14, 3), np.uint8)}))

@@ -281,6 +281,58 @@ def test_misspelt_keys_name_the_nearest(change: dict[str, Any], message: str, tm
     assert not list(tmp_path.glob("sac/*")), "something was built before the error"
 
 
+NUMBER_KEYS = ("n_timesteps", "n_envs", "buffer_size", "learning_starts", "batch_size", "learning_rate", "gamma", "tau")
+NUMBER_KEYS = (*NUMBER_KEYS, "train_freq", "gradient_steps", "noise_std", "ent_coef", "target_update_interval")
+
+
+@pytest.mark.parametrize("key", NUMBER_KEYS)
+@pytest.mark.parametrize("text", ["1e3", "'3.0e-4'", '"0.5"', "2E+4"])
+def test_numbers_that_yaml_takes_for_text(key: str, text: str, tmp_path: Path) -> None:
+    path = edited(tmp_path, lambda entry: entry.update({key: yaml.safe_load(text)}))
+    with pytest.raises(ValueError, match=rf"{TOY}: {key} must be .* That is text: leave quotes away, and give an exponent a"):
+        load_agent(path, TOY)
+
+
+@pytest.mark.parametrize(
+    "change, where",
+    [
+        ({"replay_buffer_kwargs": {"warmup_steps": "1e1"}}, "replay_buffer_kwargs, warmup_steps"),
+        ({"callback": [{"stable_baselines3.common.callbacks.CheckpointCallback": {"save_freq": "1e4"}}]}, "save_freq"),
+        ({"env_kwargs": {"n_points": "4e1"}}, "env_kwargs, n_points"),
+        ({"policy_kwargs": {"net_arch": ["1e2", 32]}}, "policy_kwargs, net_arch"),
+        ({"train_freq": ["1e1", "step"]}, "train_freq"),
+    ],
+)
+def test_numbers_as_text_deeper_down(change: dict[str, Any], where: str, tmp_path: Path) -> None:
+    path = edited(tmp_path, lambda entry: entry.update(change))
+    with pytest.raises(ValueError, match=f"{where} must be a number.* That is text"):
+        load_agent(path, TOY)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"buffer_size": 1.0e4}, "buffer_size must be an integer of at least 1, got 10000.0. Write 10000."),
+        ({"n_timesteps": 0.5}, "n_timesteps must be a whole number"),
+        ({"gamma": 99}, "gamma must be a number from 0 to 1, got 99"),
+        ({"n_envs": 0}, "n_envs must be"),
+        ({"learning_starts": True}, "learning_starts must be"),
+        ({"n_steps": 3}, "one-step returns only"),
+        ({"replay_buffer_kwargs": {"n_steps": 3}}, "one-step returns only"),
+    ],
+)
+def test_numbers_that_no_run_can_work_with(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = edited(tmp_path, lambda entry: entry.update(change))
+    with pytest.raises(ValueError, match=message):
+        load_agent(path, TOY)
+
+
+def test_texts_that_are_meant_as_such(tmp_path: Path) -> None:
+    given = {"learning_rate": "lin_3e-4", "n_timesteps": 1.0e6, "ent_coef": "auto_0.1", "gradient_steps": -1}
+    path = edited(tmp_path, lambda entry: entry.update(given))
+    assert load_agent(path, TOY).hyperparameters["learning_rate"] == "lin_3e-4"
+
+
 def test_misspelt_environments_name_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Unknown environment 'CPM/PickCub-v1'. Did you mean 'CPM/PickCube-v1'"):
         load_agent("sac", "CPM/PickCub-v1")

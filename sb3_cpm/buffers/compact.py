@@ -61,11 +61,43 @@ class Codec:
 
     def _in_shape(self, observations: np.ndarray, n_envs: int) -> np.ndarray:
         wanted = (n_envs, *self.shape)
-        observations = np.asarray(observations, dtype=self.dtype)
-        # Discrete spaces give (n_envs,) for (n_envs, 1), as in SB3
-        if observations.size != np.prod(wanted, dtype=int) or observations.shape[:1] != (n_envs,):
-            raise ValueError(f"Observation {self.key!r} has shape {observations.shape}, expected {wanted}")
-        return observations.reshape(wanted)
+        given = np.asarray(observations)
+        # Discrete spaces give (n_envs,) for (n_envs, 1), as in SB3; any other shape of as many numbers is something else
+        if given.shape != wanted and not (wanted[-1] == 1 and given.shape == wanted[:-1]):
+            raise ValueError(
+                f"Observation {self.key!r} has shape {given.shape}, expected {wanted}.{_cure(given.shape, wanted)}"
+            )
+        return self._in_dtype(given).reshape(wanted)
+
+    def _in_dtype(self, given: np.ndarray) -> np.ndarray:
+        """:raises ValueError: for values that the space's dtype has not, as 0.5 among integers"""
+        if given.dtype == self.dtype:
+            return given
+        if given.dtype.kind not in "biuf":
+            raise ValueError(f"Observation {self.key!r} must hold numbers ({self.dtype}), got {given.dtype}.")
+        with np.errstate(invalid="ignore", over="ignore"):
+            cast = given.astype(self.dtype)
+        # floats may be rounded, but not to infinity
+        lost = cast != given if self.dtype.kind != "f" else np.isinf(cast) & np.isfinite(given)
+        if lost.any():
+            raise ValueError(
+                f"Observation {self.key!r} holds {given[lost][0]!s} ({given.dtype}), its space declares {self.dtype}, which "
+                "has no such number. Has a wrapper scaled it? Declare in the space what the environment returns "
+                "(gymnasium.wrappers.TransformObservation), or give what the space says."
+            )
+        return cast
+
+
+def _cure(given: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    """What to do about a shape, where it looks like one of the usual slips."""
+    if len(wanted) == 4 and given == (wanted[0], *wanted[2:], wanted[1]):
+        return (
+            " Its channels come last, and SB3 puts them first (VecTransposeImage around the model's environment): transpose "
+            "it, image.transpose(2, 0, 1). Beside VecNormalize, make it VecNormalize(VecTransposeImage(env))."
+        )
+    if given == wanted[1:]:
+        return f" It lacks the first dimension, the {wanted[0]} environment{'s' if wanted[0] > 1 else ''}: observation[None]."
+    return " Declare in the space what the environment returns."
 
 
 class _CastCodec(Codec):

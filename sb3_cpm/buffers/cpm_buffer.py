@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
-from sb3_cpm.buffers.checks import check_arguments, check_shares
+from sb3_cpm.arguments import names_checked
+from sb3_cpm.buffers.checks import check_arguments, check_shares, checked_infos
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import NOT_SAVED, EpisodeBuffer
@@ -36,6 +37,9 @@ EXECUTED_ACTION = "cpm_executed_action"
 
 #: What the file of a buffer may hold of I.
 _OF_CHALLENGES = (Challenge, Episode, Proposal, ArtificialRewards)
+ONE_STEP = (
+    "it has one-step returns only. Leave n_steps and gamma out of replay_buffer_kwargs, and n_steps at 1 in the algorithm."
+)
 
 
 class CPMBuffer(EpisodeBuffer):
@@ -55,7 +59,9 @@ class CPMBuffer(EpisodeBuffer):
     :param optimize_memory_usage: not needed, must be False
     :param handle_timeout_termination: bootstrap at time limits
     :param n_sampled_goal: number of hindsight transitions per real one in D's share of a batch. 0, the default, works on
-        environments without goals; ``HerReplayBuffer`` has 4
+        environments without goals; ``HerReplayBuffer`` has 4. Their rewards come from the environment's ``compute_reward``,
+        as in SB3: wrappers that scale or shape the rewards of ``step()`` do not reach them, and both kinds are mixed in every
+        batch. Scale in ``compute_reward``, too
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
     :param challenge_ratio: share of P's updates (``mix="batch"``) or of each batch (``mix="row"``) from I [4.3: 0.25]
@@ -85,6 +91,7 @@ class CPMBuffer(EpisodeBuffer):
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
+    @names_checked(n_steps=ONE_STEP, gamma=ONE_STEP)
     def __init__(
         self,
         buffer_size: int,
@@ -182,13 +189,19 @@ class CPMBuffer(EpisodeBuffer):
         obs: dict[str, np.ndarray],
         next_obs: dict[str, np.ndarray],
         action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
+        reward: np.ndarray | float,
+        done: np.ndarray | bool,
+        infos: Sequence[dict[str, Any]] | dict[str, Any],
     ) -> None:
         """
         Store one transition per environment. ``infos[i]`` may name the action that was executed instead of ``action[i]``.
 
+        :param obs: observations, each of shape ``(n_envs, *observation_shape)``
+        :param next_obs: what they led to; the true last observation where an episode ends
+        :param action: within [-1, 1], as ``policy.scale_action()`` gives it, shape ``(n_envs, *action_shape)``
+        :param reward: shape ``(n_envs,)``; a number will do for one environment, and so for ``done`` and ``infos``
+        :param done: whether the episodes ended, shape ``(n_envs,)``
+        :param infos: one per environment
         :raises ValueError: if no challenger would ever fill I, an episode does not fit into the buffer, for wrong shapes,
             rewards that are not finite, values that compact storage cannot hold, a full disk; nothing is stored then
         """
@@ -197,8 +210,10 @@ class CPMBuffer(EpisodeBuffer):
                 f"CPMBuffer has challenge_ratio={self.challenge_ratio}, but nobody proposes challenges: pass "
                 "callback=ChallengerCallback() to learn() (a configuration of rl_zoo3 has the line `callback: "
                 "sb3_cpm.ChallengerCallback`), or replay_buffer_kwargs=dict(challenge_ratio=0) to use the buffer without "
-                "challenges."
+                "challenges. To fill it by hand before learn(), use add_demonstrations(), or set its challenge_ratio to 0 "
+                "meanwhile."
             )
+        infos = checked_infos(infos, self.n_envs)
         action = _executed(action, infos)
         if self.stopwatch is None:
             super().add(obs, next_obs, action, reward, done, infos)
@@ -376,7 +391,8 @@ class CPMBuffer(EpisodeBuffer):
 
     def add_demonstrations(self, source: str | Path | Sequence[Demonstration], env: Any = None) -> int:
         """
-        Add recorded episodes. They are never overwritten, and are sampled with ``demonstration_ratio``.
+        Add recorded episodes. They are never overwritten, and are sampled with ``demonstration_ratio``. Actions outside of
+        their bounds are clipped, as environments do with them, and a warning counts them.
 
         :param source: ManiSkill's trajectory file (``.h5``, with the ``.json`` of the same name beside it), or episodes
         :param env: a single environment, as made for training, in which the recorded actions are replayed; needed unless the
@@ -388,9 +404,11 @@ class CPMBuffer(EpisodeBuffer):
         check_shares(self.challenge_ratio, self.demonstration_ratio)
         if isinstance(source, (str, Path)):
             source = read_demonstrations(source, self.observation_space, self.action_space, env)
+        if isinstance(source, Demonstration):
+            source = [source]
         if not source:
-            raise ValueError("No demonstrations given")
-        steps = [step for episode in source for step in as_transitions(episode, self.observation_space, self.action_space)]
+            raise ValueError("No demonstrations given: `source` is a list of Demonstrations, or the path of ManiSkill's .h5.")
+        steps = as_transitions(source, self.observation_space, self.action_space)
         earlier = self.demonstrations
         n_earlier = 0 if earlier is None else earlier.size()
         grown = EpisodeBuffer(

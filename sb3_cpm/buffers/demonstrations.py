@@ -9,7 +9,8 @@ one, and the recorded actions are replayed in it, from the recorded seeds.
 
 import json
 import logging
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,12 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cpm.arguments import told_where
+
 logger = logging.getLogger(__name__)
+
+#: Share of a demonstration's actions that may be clipped; of more than that another unit is the likelier reason.
+MOST_CLIPPED = 0.5
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Demonstration:
 
     :param observations: one array per key of the observation space, each of shape ``(T + 1, *observation_shape)``; images may
         have their channels last, as environments give them, where the space has them first, as SB3 puts them
-    :param actions: in the environment's units, shape ``(T, *action_shape)``
+    :param actions: in the environment's units, shape ``(T, *action_shape)``; clipped to the environment's bounds
     :param rewards: shape ``(T,)``
     :param terminated: the environment ended the episode itself; if not, it was cut off and the critic bootstraps
     """
@@ -54,10 +60,13 @@ def read_demonstrations(
     path = Path(path)
     h5py = _h5py()
     if isinstance(env, VecEnv):
-        raise ValueError("Actions are replayed in a single environment, as gymnasium.make() gives it: `env` is a VecEnv")
+        raise ValueError(
+            "Actions are replayed in a single environment: `env` is a VecEnv. Pass one as gymnasium.make() or "
+            "make_maniskill_env() gives it."
+        )
     index = _read_index(path.with_suffix(".json"))
     if not path.is_file():
-        raise ValueError(f"There is no file {path}")
+        raise ValueError(f"There is no file {path}: `source` is the path of ManiSkill's .h5, or a list of Demonstrations.")
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -170,13 +179,19 @@ def _replay(env: Any, record: dict[str, Any], recorded: Any, space: spaces.Dict)
     if isinstance(seed, list):
         seed = seed[0]
     if seed is None:
-        raise ValueError(f"Episode {record['episode_id']} was recorded without a seed and cannot be replayed")
+        raise ValueError(
+            f"Episode {record['episode_id']} was recorded without a seed and cannot be replayed. Record it anew with one "
+            "(RecordEpisode keeps that of reset(seed=...)), or remove it from the .json."
+        )
     obs, info = env.reset(seed=int(seed))
     _check_start(env, recorded, record["episode_id"], seed)
     observations, rewards, terminated = [obs], [], False
     actions = recorded["actions"][:]
+    bounds = env.action_space if isinstance(env.action_space, spaces.Box) else None
     for action in actions:
-        obs, reward, terminated, truncated, info = env.step(action)
+        # what a Gaussian policy gives lies outside now and then: most environments clip it, some refuse it
+        clipped = action if bounds is None else np.clip(action, bounds.low, bounds.high)
+        obs, reward, terminated, truncated, info = env.step(clipped)
         observations.append(obs)
         rewards.append(float(reward))
         if terminated or truncated:
@@ -204,53 +219,109 @@ def _check_start(env: Any, recorded: Any, number: int, seed: int) -> None:
 
 
 def as_transitions(
-    episode: Demonstration, observation_space: spaces.Dict, action_space: spaces.Space
-) -> Iterator[tuple[Any, ...]]:
+    episodes: Sequence[Demonstration], observation_space: spaces.Dict, action_space: spaces.Space
+) -> list[tuple[Any, ...]]:
     """
-    :param episode: a demonstration
+    Actions outside of their bounds, as those of a Gaussian policy are now and then, are clipped, as environments do with them;
+    a warning counts them.
+
+    :param episodes: demonstrations
     :return: for each step, what a buffer's ``add()`` takes, for one environment
-    :raises ValueError: for shapes and values that cannot be
+    :raises ValueError: for shapes and values that cannot be, naming the demonstration, what came, and what to do
     """
-    n_steps = len(episode.rewards)
-    if n_steps == 0:
-        raise ValueError("A demonstration has no steps")
+    steps: list[tuple[Any, ...]] = []
+    n_clipped = np.zeros(len(episodes), dtype=np.int64)
+    for number, episode in enumerate(episodes):
+        with told_where(f"Demonstration {number} of {len(episodes)}"):
+            if not isinstance(episode, Demonstration):
+                raise ValueError(f"expected a sb3_cpm.buffers.Demonstration, got {type(episode).__name__}.")
+            rewards = _rewards(episode)
+            observations = _observations(episode, len(rewards), observation_space)
+            actions, n_clipped[number] = _actions(episode, len(rewards), action_space)
+        steps += _steps(observations, actions, rewards, episode.terminated)
+    if n_clipped.any():
+        warnings.warn(
+            f"Actions of demonstrations outside of {action_space} are clipped to it, as environments do: {n_clipped.sum()} "
+            f"numbers, in {np.count_nonzero(n_clipped)} of {len(episodes)} demonstrations.",
+            stacklevel=3,
+        )
+    return steps
+
+
+def _rewards(episode: Demonstration) -> np.ndarray:
+    rewards = np.asarray(episode.rewards)
+    if rewards.ndim != 1 or len(rewards) == 0 or rewards.dtype.kind not in "biuf":
+        raise ValueError(
+            f"rewards must be a number per step, shape (T,), for at least one step, got {rewards.dtype} of shape "
+            f"{rewards.shape}. Flatten them (np.ravel), or leave the demonstration out."
+        )
+    if not np.isfinite(rewards).all():
+        step = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise ValueError(
+            f"the reward of step {step} is {rewards[step]}. Rewards must be finite: mend it, or leave the demonstration out."
+        )
+    return rewards.astype(np.float32)
+
+
+def _observations(episode: Demonstration, n_steps: int, observation_space: spaces.Dict) -> dict[str, np.ndarray]:
     missing = set(observation_space.spaces) - set(episode.observations)
     if missing:
-        raise ValueError(f"A demonstration lacks the observations {sorted(missing)}")
+        raise ValueError(
+            f"it lacks the observations {sorted(missing)}. Record them, or make the training environment without them."
+        )
     observations = {}
     for key, space in observation_space.spaces.items():
         wanted = (n_steps + 1, *(space.shape or ()))
         array = np.asarray(episode.observations[key])
-        if array.shape != wanted and _fits(array.shape[1:], space):
+        if array.shape != wanted and array.shape[:1] == wanted[:1] and _fits(array.shape[1:], space):
             array = np.moveaxis(array, -1, 1)  # as SB3's VecTransposeImage does around the training environment
         if array.shape != wanted:
             raise ValueError(
-                f"A demonstration of {n_steps} steps has observations {key!r} of shape {array.shape}, expected {wanted}"
+                f"{n_steps} steps need observations {key!r} of shape {wanted} (the last one, which no action was taken in, "
+                f"included), got {array.shape}."
             )
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"observations {key!r} hold NaN or infinite values. Leave the demonstration out, or mend them.")
         observations[key] = array
+    return observations
+
+
+def _actions(episode: Demonstration, n_steps: int, space: spaces.Space) -> tuple[np.ndarray, int]:
+    """:return: actions within [-1, 1], as buffers hold them, shape ``(T, action_dim)``, and how many numbers were clipped"""
     actions = np.asarray(episode.actions)
-    if actions.shape != (n_steps, *(action_space.shape or ())):
+    if actions.shape != (n_steps, *(space.shape or ())) or actions.dtype.kind not in "biuf":
         raise ValueError(
-            f"A demonstration of {n_steps} steps has actions of shape {actions.shape}, the space is {action_space}"
+            f"{n_steps} steps need actions of shape {(n_steps, *(space.shape or ()))}, got {actions.dtype} of shape "
+            f"{actions.shape}: the environment takes {space}."
         )
-    actions = _scaled(actions, action_space).reshape(n_steps, -1)
-    for step in range(n_steps):
-        last = step == n_steps - 1
+    if not np.isfinite(actions).all():
+        raise ValueError("its actions hold NaN or infinite values. Leave the demonstration out.")
+    if not isinstance(space, spaces.Box):
+        return actions.reshape(n_steps, -1), 0
+    width = space.high.astype(np.float64) - space.low
+    if not (np.isfinite(width) & (width > 0)).all():
+        raise ValueError(f"actions are scaled by their bounds, which {space} does not have. Declare them in the environment.")
+    scaled = 2.0 * (actions - space.low.astype(np.float64)) / width - 1.0
+    outside = np.abs(scaled) > 1.001  # rounding errors are nobody's concern
+    if outside.mean() > MOST_CLIPPED:
+        raise ValueError(
+            f"{outside.mean():.0%} of the numbers in its actions lie outside of {space}, from {actions.min():.4g} to "
+            f"{actions.max():.4g}: they seem to be in other units. Scale them to the environment's, or, if the environment "
+            "clips them, do so yourself (np.clip(actions, space.low, space.high))."
+        )
+    return np.clip(scaled, -1.0, 1.0).astype(np.float32).reshape(n_steps, -1), int(outside.sum())
+
+
+def _steps(
+    observations: dict[str, np.ndarray], actions: np.ndarray, rewards: np.ndarray, terminated: bool
+) -> Iterator[tuple[Any, ...]]:
+    for step in range(len(rewards)):
+        last = step == len(rewards) - 1
         yield (
             {key: array[step][None] for key, array in observations.items()},
             {key: array[step + 1][None] for key, array in observations.items()},
             actions[step][None],
-            np.asarray([episode.rewards[step]], dtype=np.float32),
+            rewards[step][None],
             np.array([last]),
-            [{"TimeLimit.truncated": last and not episode.terminated}],
+            [{"TimeLimit.truncated": last and not terminated}],
         )
-
-
-def _scaled(actions: np.ndarray, space: spaces.Space) -> np.ndarray:
-    """To [-1, 1], as buffers hold them."""
-    if not isinstance(space, spaces.Box):
-        return actions
-    scaled = 2.0 * (actions - space.low) / (space.high - space.low) - 1.0
-    if not np.abs(scaled).max(initial=0.0) <= 1.001:  # NaN fails too
-        raise ValueError(f"A demonstration has actions in [{actions.min():.4g}, {actions.max():.4g}], outside of {space}")
-    return np.clip(scaled, -1.0, 1.0).astype(np.float32)

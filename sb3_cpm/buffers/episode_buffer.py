@@ -16,7 +16,7 @@ import inspect
 import pickle
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,20 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
 from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
-from sb3_cpm.buffers.checks import check_environment, check_spaces, checked_rewards, holds_pickles, unreadable
+from sb3_cpm.buffers.checks import (
+    check_construction,
+    check_environment,
+    check_player_reads_images,
+    check_spaces,
+    checked_actions,
+    checked_dones,
+    checked_hindsight_rewards,
+    checked_infos,
+    checked_rewards,
+    compute_reward_failed,
+    holds_pickles,
+    unreadable,
+)
 from sb3_cpm.buffers.compact import StorageSpec, make_codecs
 from sb3_cpm.buffers.saving import pack_space, unpack_space
 from sb3_cpm.buffers.sequences import draw_starts, read_sequences
@@ -48,6 +61,13 @@ NOT_SAVED = ("self", "__class__", "env", "device")
 _BOOKS = 3 * 4 + 2 * 8 + 4
 
 
+#: Key of ``infos[i]`` with the next observation as the environment gave it. What SB3 calls the ``terminal_observation`` has
+#: been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
+NEXT_OBSERVATION = "cpm_next_observation"
+#: Key of ``infos[i]`` with the reward as the environment gave it, where SB3 has another one by mistake.
+REWARD = "cpm_reward"
+
+
 class EpisodeBuffer(HerReplayBuffer):
     """
     Replay buffer of whole episodes, each observation stored once.
@@ -60,7 +80,8 @@ class EpisodeBuffer(HerReplayBuffer):
     :param n_envs: number of parallel environments
     :param optimize_memory_usage: not needed, must be False
     :param handle_timeout_termination: bootstrap at time limits
-    :param n_sampled_goal: number of hindsight transitions per real one; 0 works on environments without goals
+    :param n_sampled_goal: number of hindsight transitions per real one; 0 works on environments without goals. Their rewards
+        come from the environment's ``compute_reward``, see :class:`~sb3_cpm.buffers.CPMBuffer`
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
     :param storage_dtypes: see :class:`~sb3_cpm.buffers.CPMBuffer`
@@ -88,6 +109,8 @@ class EpisodeBuffer(HerReplayBuffer):
     ):
         self._given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_spaces(observation_space, n_sampled_goal, player_keys)
+        check_player_reads_images(observation_space)
+        check_construction(buffer_size, n_envs, optimize_memory_usage, goal_selection_strategy)
         # The parent allocates two copies of the observations and a dict per transition: give it a single slot.
         super().__init__(
             n_envs,
@@ -169,21 +192,30 @@ class EpisodeBuffer(HerReplayBuffer):
         obs: dict[str, np.ndarray],
         next_obs: dict[str, np.ndarray],
         action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
+        reward: np.ndarray | float,
+        done: np.ndarray | bool,
+        infos: Sequence[dict[str, Any]] | dict[str, Any],
     ) -> None:
         """
-        Store one transition per environment.
+        Store one transition per environment. ``infos[i]`` may have next observation and reward as the environment gave
+        them, see :data:`NEXT_OBSERVATION` and :data:`REWARD`.
 
+        :param obs: observations, each of shape ``(n_envs, *observation_shape)``
+        :param next_obs: what they led to; the true last observation where an episode ends
+        :param action: within [-1, 1], as ``policy.scale_action()`` gives it, shape ``(n_envs, *action_shape)``
+        :param reward: shape ``(n_envs,)``; a number will do for one environment, and so for ``done`` and ``infos``
+        :param done: whether the episodes ended, shape ``(n_envs,)``
+        :param infos: one per environment
         :raises ValueError: if an episode does not fit into the buffer, for wrong shapes, rewards that are not finite, values
             that compact storage cannot hold, a full disk; nothing is stored then
         """
         ring, pos, n_envs = self.ring, self.pos, self.n_envs
         # whatever can fail comes before the first change
+        infos = checked_infos(infos, n_envs)
+        next_obs, reward = _as_the_environment_gave(next_obs, reward, infos)
+        reward, done = checked_rewards(reward, n_envs), checked_dones(done, n_envs)
         encoded_next = ring.encode(next_obs)
-        reward = checked_rewards(reward, n_envs)
-        action = np.reshape(action, (n_envs, self.action_dim))
+        action = checked_actions(action, n_envs, self.action_space, self.action_dim)
         ring.final.reserve(2 * n_envs)
         encoded = None if ring.goes_on_with(obs) else ring.encode(obs)
         if encoded is not None:
@@ -294,7 +326,8 @@ class EpisodeBuffer(HerReplayBuffer):
             raise RuntimeError(
                 "Unable to sample before the end of the first episode: there is no complete one among the last "
                 f"{self.size() * self.n_envs} transitions. Set learning_starts to more than n_envs x the longest episode, "
-                "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit)."
+                "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit). A model that was "
+                "loaded needs its replay buffer too: model.load_replay_buffer(path)."
             )
 
     def _uniform_transitions(self, n: int, n_virtual: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -396,10 +429,12 @@ class EpisodeBuffer(HerReplayBuffer):
         if self.env is None:
             raise ValueError("Hindsight goals need the environment to compute their rewards: call set_env(env) first")
         infos = copy.deepcopy(self.infos[rows, envs]) if self.copy_info_dict else [{}] * len(rows)
-        # all environments are taken to be alike, as the parent does
-        return np.asarray(
-            self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])[0], dtype=np.float32
-        ).reshape(-1)
+        try:
+            # all environments are taken to be alike, as the parent does
+            rewards = self.env.env_method("compute_reward", achieved, goals, infos, indices=[0])[0]
+        except Exception as error:  # it is the user's
+            raise compute_reward_failed(len(rows), error) from error
+        return checked_hindsight_rewards(rewards, len(rows))
 
     def _get_real_samples(
         self, batch_indices: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None = None
@@ -669,3 +704,19 @@ class EpisodeBuffer(HerReplayBuffer):
             )
         super().__setstate__(state)
         self._link_views()
+
+
+def _as_the_environment_gave(next_obs: Any, reward: Any, infos: Sequence[Mapping[str, Any]]) -> tuple[Any, Any]:
+    """:return: next observations and rewards, with those of the infos in place of what SB3 has for them"""
+    copied = False
+    for env_idx, info in enumerate(infos):
+        if NEXT_OBSERVATION in info:
+            true = info[NEXT_OBSERVATION]
+            if not copied:
+                next_obs, copied = {key: np.array(array) for key, array in next_obs.items()}, True
+            for key, array in next_obs.items():
+                array[env_idx] = true[key] if isinstance(true, Mapping) else true  # of a Box there is but one
+        if REWARD in info:
+            reward = np.array(reward)
+            reward[env_idx] = info[REWARD]
+    return next_obs, reward

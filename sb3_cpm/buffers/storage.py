@@ -167,6 +167,10 @@ class ObservationRing:
         :raises ValueError: for wrong shapes and values that the storage cannot hold
         """
         encoded = {}
+        if not isinstance(observations, Mapping):
+            raise ValueError(
+                f"Observations must be dicts of arrays with the keys {sorted(self.codecs)}, got {type(observations).__name__}."
+            )
         for key, shape, dtype, codec in self._layout:
             try:
                 array = observations[key]
@@ -182,10 +186,10 @@ class ObservationRing:
         :param observations: of all environments, for the next transitions
         :return: whether they are, byte by byte, those that wait
         """
-        if self.newest_row < 0:
+        if self.newest_row < 0 or not isinstance(observations, Mapping):
             return False
         for key, waiting in self._waiting.items():
-            given = observations[key]
+            given = observations.get(key)
             if type(given) is not np.ndarray:
                 return False
             if key in self._compact:  # cheaper than to encode it again, and to compare then

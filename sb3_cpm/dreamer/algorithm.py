@@ -23,8 +23,9 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_pkl, load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_cpm.buffers import CPMBuffer
@@ -37,9 +38,10 @@ from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
 from sb3_cpm.dreamer.start import StartFrom, model_file, read_challenger, take_over_uncertainty
 from sb3_cpm.files import check_finite, verify, write_sealed
 from sb3_cpm.presets import make_preset
+from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import state_to_check
-from sb3_cpm.world_model.observations import check_action_space, unread
+from sb3_cpm.world_model.observations import check_action_space, how_to_be_read, unread
 from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 #: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
@@ -127,6 +129,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self._state: RecurrentState | None = None
         self._noise: CorrelatedNoise | None = None
         self._random_state: RandomState | None = None
+        self._watched: WatchedVecEnv | None = None
         if _init_setup_model:
             self._setup_model()
             if policy_kwargs["keys"] is None:
@@ -154,8 +157,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """Beside a player the challenger may leave things out; here nobody else reads them."""
         for key, space in unread(as_dict_space(self.observation_space), self.challenger.keys).items():
             warnings.warn(
-                f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). Let a wrapper make "
-                "it a vector (a 1-D Box; one-hot for Discrete), or name the `keys` to read.",
+                f"{type(self).__name__} reads images and vectors, so it leaves out {key!r} ({space}). {how_to_be_read(space)} "
+                "To say nothing of it, name the `keys` to read.",
                 stacklevel=4,
             )
 
@@ -222,7 +225,11 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
                 # the start states that come next, not once more those that the first run began with
                 self.env.seed(int(np.random.randint(2**31 - 1)))
         self._random_state = None
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        goes_on = not reset_num_timesteps and self._last_obs is not None
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self._watched is not None and not goes_on:  # SB3 itself has reset the environment
+            self._watched.moved = False
+        return result
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -230,6 +237,8 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """:return: actions in the environment's units, and within [-1, 1] for the buffer"""
         assert self._last_obs is not None and self._last_episode_starts is not None
         assert isinstance(self.action_space, spaces.Box)
+        if self._watched is not None and self._watched.moved:
+            self._begin_anew()
         if self._state is None or len(self._state[0]) != n_envs:
             self._state, self._noise = self.policy.initial_state(n_envs), self._make_noise()
         if self._noise is not None:
@@ -254,6 +263,23 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         if self.behavior != "exploration":
             return None
         return CorrelatedNoise(self.challenger.preset["noise_memory"], self.challenger.action_dim, self.challenger.device)
+
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """As SB3's, through an environment that keeps last observations as they were, and sees whether others use it."""
+        if self._watched is None or self._watched.venv is not env:
+            self._watched = WatchedVecEnv(env)
+        return super().collect_rollouts(self._watched, *args, **kwargs)
+
+    def _begin_anew(self) -> None:
+        """Somebody has used the training environment, to evaluate in it, say: what was seen last lies in the past."""
+        assert self._watched is not None
+        self._last_obs = self._watched.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.n_envs, dtype=bool)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_watched"]
 
     def _refuse_nan(self) -> None:
         assert self._last_obs is not None

@@ -1,7 +1,6 @@
 """Where a model may start from: what another one, or a challenger beside a player, has learnt already."""
 
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,6 +11,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.files import verify
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
+from sb3_cpm.world_model.checkpoint import is_model
 
 
 class HasChallenger(Protocol):
@@ -42,7 +42,7 @@ def read_challenger(source: StartFrom, device: th.device) -> Challenger:
             )
         return challenger
     path = model_file(source)
-    return _from_model(path, device) if _is_model(path) else Challenger.load(path, device)
+    return _from_model(path, device) if is_model(path) else Challenger.load(path, device)
 
 
 def model_file(path: str | os.PathLike) -> Path:
@@ -71,14 +71,6 @@ def take_over_uncertainty(source: Challenger | None, preset: Mapping[str, Any], 
     # what the source was built with has its preset's arguments in it already; those of another preset are newer
     changed = preset["uncertainty"].get(name, {}) if preset["uncertainty"] != source.preset["uncertainty"] else {}
     return {"uncertainty_class": theirs, "uncertainty_kwargs": {**source.uncertainty_kwargs, **changed, **(kwargs or {})}}
-
-
-def _is_model(path: Path) -> bool:
-    """torch's own files are zip archives too, with other members than SB3's."""
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return {"data", "policy.pth"} <= set(archive.namelist())
 
 
 def _from_model(path: Path, device: th.device) -> Challenger:

@@ -7,6 +7,7 @@ rules and is ruled by the seed of ``reset`` alone.
 """
 
 import copy
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,11 +17,12 @@ from gymnasium.utils import seeding
 
 from sb3_cpm.envs.batch import OBS_MODES, ManiSkillBatch
 from sb3_cpm.envs.clouds import CloudSettings
-from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, choose_renderer, explained
+from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, check_task_kwargs, choose_renderer, explained
 from sb3_cpm.envs.rendering import opened
 from sb3_cpm.envs.simulation import choose_simulation
 from sb3_cpm.envs.start_states import StartState, check_state
 from sb3_cpm.envs.visuals import choose_visuals
+from sb3_cpm.extras import needed
 
 
 class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -183,7 +185,7 @@ def make_maniskill_env(
     :param render_mode: ``"rgb_array"`` or None; for ``env.render()``, which makes frames for people and videos
     :param render_size: pixels, width and height of those frames
     :param task_kwargs: passed to the ManiSkill task
-    :raises ValueError: for an unknown task, robot, controller, camera, mode, or an impossible size
+    :raises ValueError: for an unknown task, robot, controller, camera, mode or argument, or an impossible size
     :raises RuntimeError: if assets are missing or this machine cannot render, with the cure
     """
     for name in ("num_envs", "sim_backend"):
@@ -253,7 +255,9 @@ def build_batch(
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}.")
     renderer = choose_renderer(env_id, obs_mode)
-    task = check_task(env_id, robot_uids, control_mode, reward_mode, max_episode_steps)
+    with needed("ManiSkill's tasks", "maniskill"):
+        task = check_task(env_id, robot_uids, control_mode, reward_mode, max_episode_steps)
+    check_task_kwargs(task.env_id, task_kwargs, inspect.signature(make_maniskill_env).parameters.keys() - {"task_kwargs"})
     sim_backend, simulation_kwargs = choose_simulation(
         num_envs, sim_backend, task_kwargs, renderer.backend, obs_mode == "visual"
     )

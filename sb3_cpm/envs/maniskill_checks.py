@@ -5,9 +5,10 @@ import difflib
 import inspect
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from sb3_cpm.arguments import argument_names, nearest
 from sb3_cpm.envs.assets import missing_assets, require_assets
 from sb3_cpm.envs.rendering import Renderer, ensure_renderer, without_renderer
 from sb3_cpm.envs.tasks import register_tasks, registered_name
@@ -60,6 +61,36 @@ def check_sizes(
         if not isinstance(value, int) or value < 0:
             raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}.")
     return size[0], size[1]
+
+
+#: Arguments of ManiSkill's tasks that are set here, and by which of ours.
+SET_HERE = {
+    "sensor_configs": "image_size",
+    "human_render_camera_configs": "render_size",
+    "render_backend": "the machine's devices",
+    "sim_backend": "make_maniskill_vec_env",
+    "num_envs": "make_maniskill_vec_env",
+}
+
+
+def check_task_kwargs(env_id: str, task_kwargs: Mapping[str, Any], ours: Collection[str]) -> None:
+    """
+    :param env_id: name of the task
+    :param task_kwargs: arguments that it is to be given on top of ours
+    :param ours: names of those that we take
+    :raises ValueError: for names that neither the task nor we take, with the nearest, and for what is set otherwise
+    """
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    theirs = argument_names(REGISTERED_ENVS[env_id].cls)
+    for name in task_kwargs:
+        if name in SET_HERE:
+            raise ValueError(f"{name} is set by {SET_HERE[name]}, leave it out.")
+        if theirs is not None and name not in theirs:
+            raise ValueError(
+                f"{env_id} takes no argument {name!r}.{nearest(name, {*ours, *theirs} - SET_HERE.keys())} Valid: "
+                f"{', '.join(sorted(ours))}, and of the task {', '.join(sorted(theirs - {*ours, *SET_HERE}))}."
+            )
 
 
 def choose_renderer(env_id: str, obs_mode: str) -> Renderer:

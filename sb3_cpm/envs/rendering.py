@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 from sb3_cpm.envs import vulkan, vulkan_install
 from sb3_cpm.envs.companions import companions
+from sb3_cpm.extras import check_installed
 
 SOFTWARE = ("llvmpipe", "swiftshader")
 """Parts of the device names of renderers that run on the CPU."""
@@ -74,14 +75,12 @@ def ensure_renderer() -> Renderer:
     Choose this process's renderer: a real GPU if it is usable, else the CPU's. Cheap after the first call, and the first
     costs little more than the import of SAPIEN.
 
-    :raises ImportError: if ManiSkill is not installed
+    :raises ValueError: if ManiSkill is not installed
     :raises RuntimeError: if this machine cannot render, with the cure
     """
     global _renderer
     if _renderer is None:
-        for package in ("sapien", "mani_skill"):
-            if importlib.util.find_spec(package) is None:
-                raise ImportError(f"{package} is not installed: pip install 'sb3_cpm[maniskill]'")
+        check_installed("ManiSkill's tasks", ("sapien", "mani_skill"), "maniskill")
         vulkan.activate_private()
         # A worker thread pool for pictures of 32x32 costs more than it brings, all the more with several environments.
         os.environ.setdefault("LP_NUM_THREADS", "0")

@@ -1,12 +1,13 @@
 """Where the physics run: one environment per process on the CPU, or a batch of environments on an NVIDIA GPU."""
 
-import importlib.util
 import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch as th
+
+from sb3_cpm.extras import check_installed
 
 SIM_BACKENDS = ("auto", "physx_cpu", "physx_cuda")
 
@@ -63,6 +64,7 @@ def gpu_library() -> Path:
 def check_gpu_simulation(sim_backend: str = "physx_cuda") -> None:
     """
     :param sim_backend: with the number of the GPU, if not the first
+    :raises ValueError: if SAPIEN is not installed
     :raises RuntimeError: if something is missing for simulations on an NVIDIA GPU, with the cure
     """
     index = int(sim_backend.partition(":")[2] or 0)
@@ -72,8 +74,7 @@ def check_gpu_simulation(sim_backend: str = "physx_cuda") -> None:
             f"{th.cuda.device_count()}. Use sim_backend='physx_cpu' with num_envs=1, in several processes for more; "
             "or, if there is such a GPU, install its driver and a PyTorch that was built for CUDA."
         )
-    if importlib.util.find_spec("sapien") is None:
-        raise ImportError("sapien is not installed: pip install 'sb3_cpm[maniskill]'")
+    check_installed("Simulations on the GPU", ("sapien",), "maniskill")
     import sapien
 
     if sapien.physx.is_gpu_enabled():

@@ -5,6 +5,21 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+
+def check_single(env: Any, wrapper: str) -> None:
+    """:raises ValueError: unless ``env`` is a gymnasium environment, which this wrapper can be put around"""
+    if isinstance(env, gym.Env):
+        return
+    what = f"{wrapper} is put around one gymnasium environment, not around {env!r:.80}"
+    if isinstance(env, (VecEnv, gym.vector.VectorEnv)):
+        raise ValueError(
+            f"{what}, which holds several: wrap each before they are put together, make_vec_env(env_id, n_envs=..., "
+            f"wrapper_class={wrapper}) or DummyVecEnv([lambda: {wrapper}(gym.make(env_id))])."
+        )
+    cure = f"make it first, {wrapper}(gym.make({env!r}))" if isinstance(env, str) else "make one first, with gymnasium.make()"
+    raise ValueError(f"{what}: {cure}.")
 
 
 class DictObservation(gym.Wrapper):
@@ -17,10 +32,11 @@ class DictObservation(gym.Wrapper):
 
     :param env: an environment whose observation space is a Box
     :param key: the name that the observation gets
-    :raises ValueError: when the observation space is not a Box
+    :raises ValueError: when the observation space is not a Box, or it is not a single environment
     """
 
     def __init__(self, env: gym.Env, key: str = "state") -> None:
+        check_single(env, type(self).__name__)
         super().__init__(env)
         if not isinstance(env.observation_space, spaces.Box):
             cure = "it needs no wrapper" if isinstance(env.observation_space, spaces.Dict) else "make it a Box or a Dict first"

@@ -6,9 +6,12 @@ The experiments of the report: runs as data, results as tidy CSV, figures from t
 >>> draw("mountaincar", version="quick")  # doctest: +SKIP
 """
 
-from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
-from sb3_cpm.experiments.reports import draw, ensure_data, find_data, listing, reproduce, run_experiment, summary_table
-from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunResult, RunSpec, Task
+from sb3_cpm.extras import needed
+
+with needed("Experiments", "experiments"):
+    from sb3_cpm.experiments.catalog import EXPERIMENTS, find_experiment
+    from sb3_cpm.experiments.reports import draw, ensure_data, find_data, listing, reproduce, run_experiment, summary_table
+    from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunResult, RunSpec, Task
 
 __all__ = [
     "EXPERIMENTS",

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.arguments import nearest
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
+from sb3_cpm.envs.suites import register_suite
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.run.arguments import unexpected_argument
 
@@ -90,6 +91,7 @@ def registered(env_id: str) -> str:
     """
     module, colon, name = env_id.rpartition(":")
     if not colon:
+        register_suite(env_id)
         return env_id
     try:
         importlib.import_module(module)

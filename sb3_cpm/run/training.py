@@ -27,6 +27,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
+from sb3_cpm.extras import check_installed
 from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
@@ -78,6 +79,7 @@ class Run:
         self.started = time.perf_counter()
         self.title = f"CPM-{settings.algorithm.upper()} on {settings.env}, seed {settings.seed}"
         th.set_num_threads(settings.threads)
+        check_installed("Runs", ("tensorboard", *(["imageio"] if settings.video else [])), "run")
         with contextlib.ExitStack() as undo:
             self._folder = run_folder.RunFolder(settings)
             undo.callback(self._folder.discard)

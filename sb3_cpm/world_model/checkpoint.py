@@ -2,6 +2,7 @@
 
 import io
 import os
+import zipfile
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -33,6 +34,11 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
     """
     if not Path(path).is_file():
         raise ValueError(f"There is no file {path}.")
+    if is_model(path):
+        raise ValueError(
+            f"{path} is a model that SB3 has saved; the challenger has a file of its own, which ChallengerCallback.save(path) "
+            "writes (rl_zoo3 with sb3_cpm.zoo and `sb3-cpm train` write it beside the model)."
+        )
     has_digest = verify(path, "challenger")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
@@ -56,6 +62,14 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
 def state_to_check(state: Mapping[str, Any]) -> dict[str, Any]:
     """:return: what must be finite of a challenger's state: weights, and the optimizers' averages of their gradients"""
     return {**state["networks"], "optimizers": state["optimizers"]}
+
+
+def is_model(path: str | os.PathLike) -> bool:
+    """Whether a file is a model of SB3. torch's own files are zip archives too, with other members."""
+    if not Path(path).is_file() or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"data", "policy.pth"} <= set(archive.namelist())
 
 
 def check_storable(name: str, values: Mapping[str, Any]) -> None:

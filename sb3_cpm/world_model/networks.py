@@ -6,6 +6,7 @@ slowly here: open-loop pixel error after 300 updates of a moving square 0.074 in
 """
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -80,27 +81,37 @@ class GRUCell(nn.Module):
         return torch.lerp(hidden, candidate, torch.sigmoid(update + self.update_bias))
 
 
-def cnn_layer_count(height: int, width: int, wanted: int) -> int:
+class Pyramid(NamedTuple):
     """
-    How many halvings an image gets: ``wanted``, fewer for images so small that no 2x2 feature map would be left.
+    How often an image is halved. One whose sides cannot be halved that often is padded, at the bottom and on the right: 84x84
+    pixels with four layers to 96x96.
 
-    :raises ValueError: if the image cannot be halved that often
+    :param layers: number of halvings
+    :param height: of the padded image, pixels
+    :param width: of the padded image, pixels
     """
-    layers = wanted
-    while layers > 1 and min(height, width) // 2**layers < MIN_FEATURE_MAP:
-        layers -= 1
-    step = 2**layers
-    if height % step or width % step:
-        possible = next((fewer for fewer in range(layers - 1, 0, -1) if not (height % 2**fewer or width % 2**fewer)), 0)
-        advice = (
-            f", or set the preset entry cnn_layers to {possible} (challenger_kwargs=dict(cnn_layers={possible}) of "
-            f"ChallengerCallback, preset=dict(cnn_layers={possible}) of Dreamer and Plan2Explore)"
-        )
-        raise ValueError(
-            f"Images of {height}x{width} pixels cannot be halved {layers} times. Render them at a multiple of {step} pixels "
-            f"per side (for example 32 or 64){advice if possible else ''}."
-        )
-    return layers
+
+    layers: int
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, height: int, width: int, wanted: int) -> "Pyramid":
+        """
+        :param height: of the image, pixels
+        :param width: of the image, pixels
+        :param wanted: layers that are asked for; images so small that no 2x2 feature map would be left get fewer
+        """
+        layers = wanted
+        while layers > 1 and min(height, width) // 2**layers < MIN_FEATURE_MAP:
+            layers -= 1
+        step = 2**layers
+        return cls(layers, -(-height // step) * step, -(-width // step) * step)
+
+    @property
+    def smallest(self) -> tuple[int, int]:
+        """Height and width of the last feature map."""
+        return self.height // 2**self.layers, self.width // 2**self.layers
 
 
 def convolve(convolutions: nn.Sequential, inputs: torch.Tensor, largest: int) -> torch.Tensor:
@@ -122,8 +133,8 @@ class ConvEncoder(nn.Module):
     Strided convolutions, each of which halves the image: 4 layers of depth 32 turn 32x32 into 2x2x256, the report's
     embedding of 32 * depth.
 
-    With kernel 4, stride 2 and padding 1, encoder and decoder are mirror images at any size; DreamerV2's kernels without
-    padding fit 64x64 only.
+    With kernel 4, stride 2 and padding 1, encoder and decoder are mirror images at any size (see :class:`Pyramid` for those
+    that cannot be halved); DreamerV2's kernels without padding fit 64x64 only.
 
     :param image_shape: ``(channels, height, width)``
     :param depth: channels of the first layer, doubled by each further one up to 8 * depth
@@ -133,17 +144,21 @@ class ConvEncoder(nn.Module):
     def __init__(self, image_shape: tuple[int, int, int], depth: int, layers: int) -> None:
         super().__init__()
         channels, height, width = image_shape
-        layers = cnn_layer_count(height, width, layers)
+        pyramid = Pyramid.of(height, width, layers)
+        #: pixels that are missing on the left, on the right, at the top, and at the bottom; None where none are
+        self.padding = (0, pyramid.width - width, 0, pyramid.height - height) if pyramid[1:] != (height, width) else None
         modules: list[nn.Module] = []
-        for layer in range(layers):
+        for layer in range(pyramid.layers):
             out = depth * min(2**layer, 8)
             modules += [nn.Conv2d(channels, out, kernel_size=4, stride=2, padding=1), ELU()]
             channels = out
         self.convolutions = channels_last(nn.Sequential(*modules))
-        self.output_dim = channels * (height // 2**layers) * (width // 2**layers)
-        self.largest = depth * height * width // 4
+        self.output_dim = channels * pyramid.smallest[0] * pyramid.smallest[1]
+        self.largest = depth * pyramid.height * pyramid.width // 4
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
+        if self.padding is not None:
+            images = nn.functional.pad(images, self.padding)
         return convolve(self.convolutions, images, self.largest).flatten(1)
 
 
@@ -163,19 +178,24 @@ class ConvDecoder(nn.Module):
     ) -> None:
         super().__init__()
         channels, height, width = image_shape
-        layers = cnn_layer_count(height, width, layers)
-        widths = [depth * min(2**layer, 8) for layer in reversed(range(layers))]
-        self.feature_map = (widths[0], height // 2**layers, width // 2**layers)
+        pyramid = Pyramid.of(height, width, layers)
+        #: height and width of the image, where what is drawn is larger
+        self.cut = (height, width) if pyramid[1:] != (height, width) else None
+        widths = [depth * min(2**layer, 8) for layer in reversed(range(pyramid.layers))]
+        self.feature_map = (widths[0], *pyramid.smallest)
         self.linear = OneHotLinear(input_dim, self.feature_map[0] * self.feature_map[1] * self.feature_map[2], one_hot)
         modules: list[nn.Module] = []
         for wide, narrow in pairwise(widths):
             modules += [Deconvolution(wide, narrow), ELU()]
         self.convolutions = channels_last(nn.Sequential(*modules, Deconvolution(widths[-1], channels)))
-        self.largest = depth * height * width // 4
+        self.largest = depth * pyramid.height * pyramid.width // 4
 
     def forward(self, feat: torch.Tensor) -> torch.Tensor:
         features = self.linear(feat).unflatten(1, self.feature_map)
-        return convolve(self.convolutions, features.contiguous(memory_format=torch.channels_last), self.largest)
+        drawn = convolve(self.convolutions, features.contiguous(memory_format=torch.channels_last), self.largest)
+        if self.cut is None:
+            return drawn
+        return drawn[:, :, : self.cut[0], : self.cut[1]].contiguous(memory_format=torch.channels_last)
 
 
 class Encoder(nn.Module):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
+from sb3_cpm.spaces import is_cloud, is_vector, looks_like_cloud
 from sb3_cpm.world_model.acceleration import cache_slices
 
 MIN_FEATURE_MAP = 2  # the smallest feature map of the CNN, pixels per side
@@ -102,7 +103,7 @@ class ObservationSpec:
                 raise ValueError(
                     "No observation key is usable by the challenger: it reads images (3-D Box with finite bounds) "
                     f"and vectors (1-D Box), the space has { {key: str(sub) for key, sub in space.items()} }. A point cloud "
-                    "is read if `keys` names it."
+                    "is read if `keys` names it; stacked states are best flattened (gymnasium.wrappers.FlattenObservation)."
                 )
             for key, sub in space.items():
                 if is_rangeless_image(sub):
@@ -257,9 +258,9 @@ UINT8_RANGE = (0.0, 255.0)
 RANGE_TOLERANCE = 1e-3  # by this share of its range an image may leave it: a buffer that stores images small rounds them
 GREATEST_RANGE = 2.0**32  # bounds wider than that (the limits of float32, say) tell nothing about an image
 RANGELESS = (
-    "{space} looks like an image, but has no finite bounds with room between them, so nothing says what is black and what is "
-    "white. Let the environment return uint8, or declare the bounds, as Box(0.0, 1.0, shape), with gymnasium's "
-    "TransformObservation."
+    "{space} looks like an image, but has no finite bounds with room between them (the limits of its dtype are none), so "
+    "nothing says what is black and what is white. Let the environment return uint8, or declare the bounds, as Box(0.0, 1.0, "
+    "shape), with gymnasium's TransformObservation."
 )
 
 
@@ -279,7 +280,19 @@ def unread(space: spaces.Dict, keys: Collection[str]) -> dict[str, spaces.Space]
     :return: the others that nobody could have known of: point clouds are read on request only, and of images without bounds
         :class:`ObservationSpec` has told
     """
-    return {key: sub for key, sub in space.items() if key not in keys and not is_cloud(sub) and not is_rangeless_image(sub)}
+    return {
+        key: sub for key, sub in space.items() if key not in keys and not looks_like_cloud(sub) and not is_rangeless_image(sub)
+    }
+
+
+def how_to_be_read(space: spaces.Space) -> str:
+    """:return: what to do about an observation that is left out"""
+    if is_cloud(space):
+        return (
+            "It may be a point cloud. If it is not (stacked states, say), flatten it (gymnasium.wrappers.FlattenObservation, "
+            "before it goes into the Dict); or name all `keys`, this one too, to have it read as one long vector."
+        )
+    return "Let a wrapper make it a vector (a 1-D Box; one-hot for Discrete)."
 
 
 def is_rangeless_image(space: spaces.Space) -> bool:
@@ -288,20 +301,15 @@ def is_rangeless_image(space: spaces.Space) -> bool:
 
 
 def image_range(space: spaces.Space) -> tuple[float, float] | None:
-    """Smallest and greatest value of a 3-D Box; None where it has no bounds, or none that leave room for an image."""
+    """Smallest and greatest value of a 3-D Box; None where it has no bounds, or none that tell what an image holds."""
     assert isinstance(space, spaces.Box)
     low, high = float(space.low.min()), float(space.high.max())
+    if space.dtype.kind in "iu" and space.dtype.itemsize > 1:
+        # where nothing better is known, the limits of the dtype are declared: int16 for colours, uint16 for millimetres
+        limits = np.iinfo(space.dtype)
+        if high >= limits.max or (limits.min < 0 and low <= limits.min):
+            return None
     return (low, high) if 0.0 < high - low <= GREATEST_RANGE else None
-
-
-def is_vector(space: spaces.Space) -> bool:
-    """1-D Box."""
-    return isinstance(space, spaces.Box) and len(space.shape) == 1
-
-
-def is_cloud(space: spaces.Space) -> bool:
-    """2-D float Box, (points, features)."""
-    return isinstance(space, spaces.Box) and len(space.shape) == 2 and np.issubdtype(space.dtype, np.floating)
 
 
 def check_action_space(space: spaces.Space) -> None:

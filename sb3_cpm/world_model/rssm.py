@@ -201,6 +201,7 @@ class RSSM(nn.Module):
         assert isinstance(self.latent, GaussianLatent)
         gates, hidden = self.gru.gates.weight, self.input_action.out_features
         hidden_layer, _, output_layer = self.prior_net
+        assert isinstance(hidden_layer, nn.Linear) and isinstance(output_layer, nn.Linear)
         return Dynamics(
             self.latent,
             torch.cat((self.input_action.weight, self.input_stoch.weight), dim=1),

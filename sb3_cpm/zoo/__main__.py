@@ -44,12 +44,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         sys.stderr.write(f'error: rl_zoo3 is missing ({error}): pip install "sb3_cpm[zoo]"\n')
         return 1
-    from sb3_cpm.zoo.registration import register_robotics
+    from sb3_cpm.envs.suites import register_suite
 
     try:
         rest = complete(command, rest)
         sys.argv = [f"{sys.argv[0]} {command}", *rest]
-        register_robotics(_option("--env", rest))
+        register_suite(_option("--env", rest))
         _run(COMMANDS[command])
     except ValueError as error:
         if not _explains_itself(error):

@@ -22,8 +22,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.arguments import nearest
+from sb3_cpm.envs.suites import register_suite
 from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
-from sb3_cpm.zoo.registration import register_robotics
 
 
 class Built(NamedTuple):
@@ -208,7 +208,7 @@ def ensure_registered(env_id: str) -> None:
 
     :raises ValueError: if gymnasium does not know it, with the nearest name
     """
-    register_robotics(env_id)
+    register_suite(env_id)
     if env_id not in gym.registry:
         raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
 

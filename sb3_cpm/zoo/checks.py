@@ -10,26 +10,44 @@ and names of environments that do not exist.
 import difflib
 import importlib
 import inspect
+import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cpm.arguments import argument_names, check_arguments, check_names, nearest, told_where
+from sb3_cpm.arguments import (
+    AT_LEAST_0,
+    SHARE,
+    Rule,
+    argument_names,
+    check,
+    check_arguments,
+    check_names,
+    integer,
+    nearest,
+    number,
+    told_where,
+)
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
+from sb3_cpm.buffers.cpm_buffer import ONE_STEP
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenger import check_uncertainties, choose_uncertainty
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.extras import needed
 from sb3_cpm.presets import make_preset
 from sb3_cpm.zoo.registration import ENV_IDS, NAMESPACE
+
+with needed("Configurations", "zoo"):
+    import yaml
 
 #: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
 ZOO_KEYS = (
@@ -46,13 +64,30 @@ ZOO_KEYS = (
     "noise_std",
 )
 
+#: What the keys that are numbers must be, whatever the algorithm. ``n_timesteps`` may be a float, as 1.0e+6 is one to YAML.
+NUMBERS: dict[str, Rule] = {
+    **{
+        key: number("a whole number of at least 1", lambda value: value >= 1 and value.is_integer())
+        for key in ("n_timesteps",)
+    },
+    **{key: integer(1) for key in ("n_envs", "buffer_size", "batch_size", "frame_stack")},
+    "learning_starts": integer(0),
+    "gradient_steps": integer(-1),
+    **{key: SHARE for key in ("gamma", "tau")},
+    "noise_std": AT_LEAST_0,
+}
+
+#: What YAML 1.1 takes for text, though whoever wrote it meant a number: 1e4, 3e-4, 1.0e2.
+EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")
+
 #: Arguments that algorithms give to policies themselves.
 SET_FOR_POLICIES = ("observation_space", "action_space", "lr_schedule")
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
     """:return: rl_zoo3's algorithms by name, ours included"""
-    from rl_zoo3.utils import ALGOS
+    with needed("Configurations", "zoo"):
+        from rl_zoo3.utils import ALGOS
 
     return ALGOS
 
@@ -137,6 +172,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     missing = {"policy", "n_timesteps"} - set(hyperparameters)
     if missing:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
+    _check_numbers(hyperparameters, where)
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
         with told_where(f"{where}, {key}"):
             named = named_with_arguments(hyperparameters.get(key))
@@ -148,6 +184,42 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     if issubclass(algorithm, DreamerAlgorithm):
         _check_world_model({**hyperparameters, **(policy_kwargs or {})}, where)
     _check_env_kwargs(hyperparameters.get("env_kwargs"), env_id, f"{where}, env_kwargs")
+
+
+def _check_numbers(hyperparameters: Mapping[str, Any], where: str) -> None:
+    """
+    :raises ValueError: for numbers that YAML takes for text, at any depth, and for those that no algorithm can work with
+    """
+    for key, value in hyperparameters.items():
+        rule = NUMBERS.get(key)
+        if isinstance(value, str) and _is_number(value):
+            whole = rule is not None and not rule.holds(0.5)
+            words = "a number" if rule is None else rule.words
+            check(f"{where}: {key}", value, Rule(words, lambda value: isinstance(value, int if whole else float)))  # noqa: B023
+        elif rule is not None and value is not None:
+            check(f"{where}: {key}", value, rule)
+        else:
+            _check_nested(f"{where}: {key}", value)
+
+
+def _check_nested(name: str, value: Any) -> None:
+    """Deeper down a number in quotes may be meant as text, an exponent is not."""
+    if isinstance(value, str) and EXPONENT.fullmatch(value.strip()):
+        check(name, value, number("a number", lambda value: True))
+    elif isinstance(value, Mapping):
+        for key, part in value.items():
+            _check_nested(f"{name}, {key}", part)
+    elif isinstance(value, (list, tuple)):
+        for part in value:
+            _check_nested(name, part)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
@@ -188,6 +260,8 @@ def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgori
         kind = CPMBuffer if issubclass(algorithm, DreamerAlgorithm) else ReplayBuffer
     check_arguments(where, kwargs, kind, excluded=SET_BY_ALGORITHMS)
     if isinstance(kind, type) and issubclass(kind, CPMBuffer):
+        if issubclass(algorithm, OffPolicyAlgorithm) and (hyperparameters.get("n_steps") or 1) > 1:
+            raise ValueError(f"{where}: {ONE_STEP}")
         arguments = {**_defaults(CPMBuffer), **kwargs}
         with told_where(where):
             for part in (check_values, ChallengeCurator):

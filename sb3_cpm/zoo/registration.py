@@ -56,21 +56,6 @@ def register_tasks() -> None:
                 )
 
 
-def register_robotics(env_id: str) -> None:
-    """
-    Import gymnasium-robotics, if it is what registers an environment. Not before: it takes a quarter of a second and MuJoCo.
-
-    :param env_id: one that nobody has registered, or any other
-    :raises ValueError: if gymnasium-robotics is missing
-    """
-    if env_id not in gym.registry and env_id.startswith(("PointMaze", "AntMaze", "Fetch")):
-        try:
-            import gymnasium_robotics
-        except ImportError as error:
-            raise ValueError(f"{env_id} needs a package that is missing: pip install gymnasium-robotics") from error
-        gym.register_envs(gymnasium_robotics)
-
-
 def make_task(task: str, render_mode: str | None = None, **kwargs: Any) -> gym.Env:
     """
     What gymnasium calls to make an environment.

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_cpm.envs import DictObservation
+from sb3_cpm.envs.wrappers import check_single
 
 
 class TerminationIsSuccess(gym.Wrapper[Any, Any, Any, Any]):
@@ -14,7 +15,12 @@ class TerminationIsSuccess(gym.Wrapper[Any, Any, Any, Any]):
     Say ``is_success`` where an environment only says so by ending the episode, such as MountainCarContinuous-v0.
 
     :param env: the environment; its ``terminated`` must mean success
+    :raises ValueError: if it is not a single environment
     """
+
+    def __init__(self, env: gym.Env) -> None:
+        check_single(env, type(self).__name__)
+        super().__init__(env)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -27,6 +33,7 @@ def as_dict(env: gym.Env) -> gym.Env:
 
     :param env: the environment
     """
+    check_single(env, "as_dict")
     return DictObservation(env) if isinstance(env.observation_space, spaces.Box) else env
 
 
@@ -41,6 +48,7 @@ class RGBD(gym.ObservationWrapper[Any, Any, Any]):
     """
 
     def __init__(self, env: gym.Env, max_depth: float = 2.0) -> None:
+        check_single(env, type(self).__name__)
         super().__init__(env)
         self.batch: Any = env.get_wrapper_attr("batch") if env.has_wrapper_attr("batch") else None
         if self.batch is None or not self.batch.cameras:
