@@ -367,7 +367,6 @@ def test_an_uncertainty_class_of_ones_own_has_to_be_named_when_loading(tmp_path:
         (VECTOR, spaces.Box(np.float32([-1, 0.5]), np.float32([1, 0.5])), {}, r"dimension 1 .* from 0.5 to 0.5.* no room"),
         (VECTOR, spaces.Box(-3e38, 3e38, (2, 3)), {}, r"dimension \(0, 0\) .* from -3e\+38 .* too wide.*RescaleAction"),
         (spaces.Dict({"a": image(32), "b": image(64)}), box(2), {}, "a: 32x32, b: 64x64"),
-        (spaces.Dict({"camera": image(84)}), box(2), {}, "84x84 pixels cannot be halved"),
         (spaces.Dict({"d": spaces.Discrete(3)}), box(2), {}, "No observation key is usable"),
         (VECTOR, box(2), {"horizn": 3}, "Did you mean 'horizon'"),
         (VECTOR, box(2), {"latent": "uniform"}, "'latent' must be"),
