@@ -12,6 +12,7 @@ from sb3_cpm.buffers import EXECUTED_ACTION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.exploration import ExplorationVecEnv, make_decay
+from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 TINY = dict(batch_size=2, sequence_length=8, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=8, hidden_size=16)
 NAMES = ["constant", "linear", "exponential", "inverse_time", "cosine", "logistic"]
@@ -244,3 +245,52 @@ def test_environments_that_misbehave(how, error, message):
     with pytest.raises(error, match=message):
         wrapper.step(np.zeros((2, 2), dtype=np.float32))
     assert taken_off == [True]
+
+
+# ---------------------------------------------------------------- noise that perseveres
+
+
+def draws(noise, steps, envs=(0,)):
+    return np.array([noise.draw(np.array(envs)).numpy() for _ in range(steps)])
+
+
+@pytest.mark.parametrize("memory, expected", [(0.0, 0.0), (5.0, np.exp(-1 / 5)), (20.0, np.exp(-1 / 20))])
+def test_noise_is_standard_normal_and_correlated_over_its_memory(memory, expected):
+    th.manual_seed(0)
+    numbers = draws(CorrelatedNoise(memory, 2, th.device("cpu")), 4000, envs=range(8))
+    assert numbers.mean() == pytest.approx(0.0, abs=0.06) and numbers.std() == pytest.approx(1.0, abs=0.04)
+    assert np.corrcoef(numbers[:-1].ravel(), numbers[1:].ravel())[0, 1] == pytest.approx(expected, abs=0.02)
+    assert abs(np.corrcoef(numbers[:, 0, 0], numbers[:, 1, 0])[0, 1]) < 0.15, "environments have noise of their own"
+
+
+def test_noise_begins_anew_with_an_episode_and_waits_while_others_act():
+    th.manual_seed(0)
+    noise = CorrelatedNoise(1e6, 1, th.device("cpu"))
+    first, second = (noise.draw(np.array([env])).item() for env in (0, 3))
+    assert noise.draw(np.array([0])).item() == pytest.approx(first, abs=0.02), "with such a memory it hardly moves"
+    noise.restart(np.array([0]))
+    assert abs(noise.draw(np.array([0])).item() - first) > 0.05
+    assert noise.draw(np.array([3])).item() == pytest.approx(second, abs=0.02)
+
+
+def test_what_noise_makes_of_a_policy_is_that_policy():
+    """Each action has the actor's distribution; only what follows on it is correlated."""
+    challenger = Challenger(spaces.Dict({"state": spaces.Box(-1, 1, (4,))}), spaces.Box(-1, 1, (2,)), "cpu", **TINY)
+    state = challenger.initial_state(4000)
+    th.manual_seed(0)
+    white = challenger.act(state)
+    coloured = challenger.act(state, noise=CorrelatedNoise(10.0, 2, th.device("cpu")).draw(np.arange(4000)))
+    assert np.abs(coloured).max() <= 1.0
+    assert np.allclose(np.quantile(coloured, [0.1, 0.5, 0.9], 0), np.quantile(white, [0.1, 0.5, 0.9], 0), atol=0.06)
+
+
+@pytest.mark.parametrize("memory, wanted", [(0.0, (-0.2, 0.2)), (50.0, (0.8, 1.0))])
+def test_the_challengers_actions_in_a_run_persevere(memory, wanted):
+    wrapper = make_wrapper(epsilon=1.0, n_envs=1, env_id="CPMToy-v0", keys=["state"])
+    wrapper._noise = CorrelatedNoise(memory, 2, th.device("cpu"))
+    actions = []
+    for _ in range(300):
+        _, _, _, infos = wrapper.step(np.zeros((1, 2), dtype=np.float32))
+        actions.append(infos[0][EXECUTED_ACTION])
+    correlation = np.corrcoef(np.ravel(actions[:-1]), np.ravel(actions[1:]))[0, 1]
+    assert wanted[0] <= correlation <= wanted[1]

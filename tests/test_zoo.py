@@ -1029,3 +1029,19 @@ def test_optimize_and_train_with_a_trial(warm: Command, tmp_path: Path) -> None:
     values = dict(yaml.unsafe_load(saved))
     assert search.OURS not in values and {"challenge_ratio", "mix"} <= set(values["replay_buffer_kwargs"])
     assert "decay" in values["callback"][0]["sb3_cpm.ChallengerCallback"]
+
+
+def test_pink_noise_is_what_sac_tries_and_not_what_it_learns_from(tmp_path: Path) -> None:
+    policy = {"policy": "sb3_cpm.zoo.pink_noise.PinkNoisePolicy", "policy_kwargs": {"noise_length": 200}}
+    built = load_agent("sac", "MountainCarContinuous-v0", {**policy, "learning_starts": 0}).build(0, device="cpu")
+    model, observation = built.model, np.zeros((2, 2), dtype=np.float32)
+    tried = np.array([model.predict(observation)[0] for _ in range(400)])
+    assert np.corrcoef(tried[:-1, 0, 0], tried[1:, 0, 0])[0, 1] > 0.3, "steps in a row are alike"
+    assert abs(np.corrcoef(tried[:, 0, 0], tried[:, 1, 0])[0, 1]) < 0.5, "environments are not"
+    assert np.array_equal(model.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0])
+    learnt, _ = model.actor.action_log_prob(th.zeros(400, 2))  # type: ignore[attr-defined]
+    series = learnt.detach().numpy().ravel()
+    assert abs(np.corrcoef(series[:-1], series[1:])[0, 1]) < 0.15
+    model.save(tmp_path / "model")
+    assert SAC.load(tmp_path / "model", device="cpu").policy.noise_length == 200
+    built.env.close()
