@@ -756,6 +756,7 @@ def stopped(_stopped: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore:The last trajectory")
+@pytest.mark.filterwarnings("ignore:The exploration probability had fallen:UserWarning")  # told of in a test of its own
 class TestGoingOn:
     def test_the_buffer_takes_what_can_change_and_the_rest_is_told(
         self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -788,7 +789,6 @@ class TestGoingOn:
         run_tiny(tmp_path, 10, trained_agent=str(stopped / f"{TOY}.zip"), tensorboard_log=str(tmp_path / "tb"))
         assert [path.parent.name for path in tmp_path.glob("tb/*/*/events*")] == ["SAC_3"]
 
-    @pytest.mark.filterwarnings("ignore:The exploration probability had fallen:UserWarning")
     def test_learning_starts_does_not_pile_up(self, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         agent, config = stopped / f"{TOY}.zip", tiny(tmp_path, learning_starts=None)
         for n_steps in (60, 120):
