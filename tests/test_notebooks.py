@@ -102,9 +102,9 @@ def client(tmp_path_factory):
     """
     Of one kernel for all notebooks: a minute would be spent on importing PyTorch and ManiSkill ten times.
 
-    A process that the machine has no time for must not look like one that failed: the six decays of notebook 05, the longest
-    cell of all, take a minute of CPU time, and on a machine that many share more than the ten minutes that a cell once had. So
-    limits are only for what hangs. And matplotlib says so in a notebook if it takes it 5 s to look for fonts, so it does here.
+    A process that the machine has no time for must not look like one that failed: alone, notebook 05 trains all five agents in
+    one cell, 40 CPU seconds, and on a machine that many share that was more than the ten minutes that a cell had. So limits
+    are only for what hangs. And matplotlib says so in a notebook if it takes it 5 s to look for fonts, so it does that here.
     """
     importlib.import_module("matplotlib.font_manager")
     results = tmp_path_factory.mktemp("results")  # of all notebooks: several draw the runs of one experiment
