@@ -106,7 +106,8 @@ PPO_CLOUD = Contender("PPO point cloud", "ppo_pointcloud")
 PICKCUBE_AGENTS = (HIGH, SIMPLE, DREAMER, PPO_CLOUD, PPO_RGBD, SAC_CLOUD)
 LOG = Contender("CPM log", "cpm_sac", challenger(uncertainty_kwargs={"metric": "log"}))
 DECAYS = tuple(
-    Contender(f"CPM {name}", "cpm_sac", challenger(decay=name))
+    # the default is not named: these runs are those of CPM-SAC
+    Contender(f"CPM {name}", "cpm_sac", {} if name == "linear" else challenger(decay=name))
     for name in ("constant", "linear", "exponential", "inverse_time", "cosine", "logistic")
 )
 NO_CHALLENGES = Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}})

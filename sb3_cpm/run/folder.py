@@ -8,15 +8,16 @@ import sys
 from contextlib import ExitStack, suppress
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cpm import __version__
 from sb3_cpm.files import LOCK, check_finite, disk_errors_named, locked, write_sealed, write_text
 from sb3_cpm.run.settings import TrainSettings
+
+if TYPE_CHECKING:  # whoever only reads results can do without
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 PACKAGES = (
     "stable_baselines3",
@@ -104,7 +105,7 @@ def _not_empty(folder: Path) -> str:
     )
 
 
-def save_model(path: Path, model: BaseAlgorithm) -> None:
+def save_model(path: Path, model: "BaseAlgorithm") -> None:
     """
     SB3's own archive, written whole, with a digest.
 
@@ -113,6 +114,8 @@ def save_model(path: Path, model: BaseAlgorithm) -> None:
     :raises NotFiniteError: if a weight is not finite; the last good file stays
     :raises NotWrittenError: if the disk does not take it; the last good file stays, too
     """
+    from stable_baselines3.common.save_util import recursive_getattr
+
     _, variables = model._get_torch_save_params()
     check_finite(path, "model", {name: recursive_getattr(model, name, None) for name in variables} | model.get_parameters())
     write_sealed(path, model.save)
