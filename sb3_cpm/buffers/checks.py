@@ -1,7 +1,6 @@
 """What a :class:`~sb3_cpm.buffers.CPMBuffer` cannot work with, said in words."""
 
 import inspect
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY
+from stable_baselines3.her.goal_selection_strategy import KEY_TO_GOAL_STRATEGY, GoalSelectionStrategy
 
 from sb3_cpm.arguments import AT_LEAST_0, SHARE, check, check_each, integer, nearest
 from sb3_cpm.spaces import is_cloud, is_vector
@@ -55,6 +54,9 @@ def _check_part(key: str, space: spaces.Space) -> None:
     if isinstance(space, spaces.MultiDiscrete) and len(space.shape) > 1:
         raise ValueError(f"Observation {key!r} is {space}: SB3 takes MultiDiscrete of one dimension only. Flatten it.")
 
+
+#: The largest reward that a replay buffer can hold.
+LARGEST = float(np.finfo(np.float32).max)
 
 #: Pixels per side that SB3's NatureCNN needs at least; its three convolutions leave 1x1 of them.
 NATURE_CNN_NEEDS = 36
@@ -108,9 +110,9 @@ def check_construction(buffer_size: int, n_envs: int, optimize_memory_usage: boo
         raise ValueError(
             "optimize_memory_usage=True is not for this buffer, which stores every observation once anyway: leave it out."
         )
-    if isinstance(strategy, str) and strategy.lower() not in KEY_TO_GOAL_STRATEGY:
+    if not isinstance(strategy, GoalSelectionStrategy) and str(strategy).lower() not in KEY_TO_GOAL_STRATEGY:
         raise ValueError(
-            f"Unknown goal_selection_strategy {strategy!r}.{nearest(strategy, KEY_TO_GOAL_STRATEGY)} Valid: "
+            f"Unknown goal_selection_strategy {strategy!r}.{nearest(str(strategy), KEY_TO_GOAL_STRATEGY)} Valid: "
             f"{', '.join(KEY_TO_GOAL_STRATEGY)}."
         )
 
@@ -167,11 +169,11 @@ def checked_rewards(reward: Any, n_envs: int) -> np.ndarray:
     """
     array = _per_environment("Rewards", "one number", reward, n_envs)
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"Rewards must be numbers, got {reward!r}.")
+        raise ValueError(f"Rewards must be numbers, got {reward!r}: give one per environment, as np.array([0.5]).")
     for env_idx, value in enumerate(array.tolist()):
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:  # NaN fails too
             raise ValueError(
-                f"Environment {env_idx} gave a reward of {value}: rewards must be finite. "
+                f"Environment {env_idx} gave a reward of {value}: rewards must be finite (as float32). "
                 "stable_baselines3.common.vec_env.VecCheckNan helps to find where it comes from."
             )
     return array
@@ -185,7 +187,7 @@ def checked_dones(done: Any, n_envs: int) -> np.ndarray:
     """
     array = _per_environment("Dones", "True or False", done, n_envs)
     if array.dtype.kind not in "biuf" or not all(value in (0, 1) for value in array.tolist()):
-        raise ValueError(f"Dones must be True or False, got {done!r}.")
+        raise ValueError(f"Dones must be True or False, got {done!r}: give one per environment, as np.array([False]).")
     return array.astype(bool)
 
 
@@ -236,8 +238,14 @@ def checked_actions(action: Any, n_envs: int, space: spaces.Space, action_dim: i
             f"Actions have shape {array.shape} and dtype {array.dtype}, expected numbers of shape {(n_envs, *shape)}: one row "
             "per environment, scaled to [-1, 1] as policy.scale_action() does."
         )
-    if array.dtype.kind == "f" and not math.isfinite(array.sum()):
-        raise ValueError(f"Actions must be finite, got {array.tolist()}.")
+    if isinstance(space, spaces.Box):
+        if not (array.min(initial=0.0) >= -1.001 and array.max(initial=0.0) <= 1.001):  # NaN fails too
+            raise ValueError(
+                f"Actions must be finite and lie within [-1, 1], got {array.tolist()}: scale them from the environment's "
+                "units with policy.scale_action(), as SB3 does."
+            )
+    elif (array != np.clip(np.trunc(array), -(2**31), 2**31)).any():  # NaN is different from itself
+        raise ValueError(f"Actions of {space} must be whole numbers, got {array.tolist()}.")
     return array.reshape(n_envs, action_dim)
 
 
@@ -249,16 +257,18 @@ def checked_hindsight_rewards(rewards: Any, n: int) -> np.ndarray:
     :raises ValueError: unless they are ``n`` finite numbers
     """
     try:
-        array = np.asarray(rewards, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"compute_reward must return {n} numbers for a batch of {n} goals, got {rewards!r:.100}.") from error
+        array = np.asarray(rewards)
+    except ValueError:  # lists within lists
+        array = np.zeros(0, dtype=object)
+    if array.dtype.kind not in "biuf" and array.size:
+        raise ValueError(f"compute_reward must return {n} numbers for a batch of {n} goals, got {rewards!r:.100}.")
     if array.shape not in ((n,), (n, 1)) and not (n == 1 and array.size == 1):
         raise ValueError(
             f"compute_reward returned shape {array.shape} for a batch of {n} pairs of goals. It must return one reward per "
             f"row, shape ({n},): compute along the last axis, as np.linalg.norm(achieved_goal - desired_goal, axis=-1), and "
             "compare with np.where(...) instead of if."
         )
-    broken = np.flatnonzero(~np.isfinite(array.reshape(-1)))
+    broken = np.flatnonzero(~(np.abs(array.reshape(-1)) <= LARGEST))
     if len(broken):
         raise ValueError(
             f"compute_reward returned {array.reshape(-1)[broken[0]]} for {len(broken)} of {n} pairs of goals: rewards must be "

@@ -255,8 +255,9 @@ def _rewards(episode: Demonstration) -> np.ndarray:
             f"rewards must be a number per step, shape (T,), for at least one step, got {rewards.dtype} of shape "
             f"{rewards.shape}. Flatten them (np.ravel), or leave the demonstration out."
         )
-    if not np.isfinite(rewards).all():
-        step = int(np.flatnonzero(~np.isfinite(rewards))[0])
+    broken = np.flatnonzero(~(np.abs(rewards) <= np.finfo(np.float32).max))
+    if len(broken):
+        step = int(broken[0])
         raise ValueError(
             f"the reward of step {step} is {rewards[step]}. Rewards must be finite: mend it, or leave the demonstration out."
         )
@@ -297,6 +298,8 @@ def _actions(episode: Demonstration, n_steps: int, space: spaces.Space) -> tuple
     if not np.isfinite(actions).all():
         raise ValueError("its actions hold NaN or infinite values. Leave the demonstration out.")
     if not isinstance(space, spaces.Box):
+        if (actions != np.clip(np.trunc(actions), -(2**31), 2**31)).any():
+            raise ValueError(f"its actions must be whole numbers, those of {space}. Leave the demonstration out.")
         return actions.reshape(n_steps, -1), 0
     width = space.high.astype(np.float64) - space.low
     if not (np.isfinite(width) & (width > 0)).all():

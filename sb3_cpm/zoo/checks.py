@@ -169,7 +169,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     algorithm = algorithms()[algo]
     arguments = set(inspect.signature(algorithm.__init__).parameters) - {"self", "env", "seed", "device"}
     check_names(where, hyperparameters, {*arguments, *ZOO_KEYS})
-    missing = {"policy", "n_timesteps"} - set(hyperparameters)
+    missing = {key for key in ("policy", "n_timesteps") if hyperparameters.get(key) is None}
     if missing:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
     _check_numbers(hyperparameters, where)
@@ -279,6 +279,8 @@ def _policy(policy: Any, algo: str, where: str) -> Any:
             )
         return aliases[policy]
     kind = _imported(policy, f"{where}, policy") if isinstance(policy, str) else policy
+    if not isinstance(kind, type):
+        raise ValueError(f"{where}: policy must be a name ({', '.join(aliases)}) or a class with its module, got {policy!r}.")
     others = [other for other, one in algorithms().items() if _is_policy_of(one, kind)]
     if others and algo not in others:
         raise ValueError(
