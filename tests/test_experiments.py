@@ -704,7 +704,7 @@ def test_runs_end_with_the_process_that_started_them(tmp_path):
     wait_until(is_free)
 
 
-def wait_until(holds, seconds=60):
+def wait_until(holds, seconds=180):
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "waited in vain"
