@@ -17,7 +17,7 @@ import pytest
 import standin_assets
 
 from sb3_cpm.__main__ import main
-from sb3_cpm.envs import assets, make_maniskill_env
+from sb3_cpm.envs import assets, make_maniskill_env, vulkan
 
 pytestmark = pytest.mark.maniskill
 
@@ -301,6 +301,7 @@ for env_id in REPORT_TASKS:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(vulkan.private_in_use(), reason="without its private installation SAPIEN lacks other libraries here, too")
 def test_states_without_a_vulkan_driver_are_the_same(standins: Path) -> None:
     with_driver = run(["-c", STATES.replace("DRAWS", "True")], MS_ASSET_DIR=str(standins))
     without = run(["-c", STATES.replace("DRAWS", "False")], MS_ASSET_DIR=str(standins), **NOWHERE)
