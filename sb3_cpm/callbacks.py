@@ -33,7 +33,7 @@ from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty.base import Uncertainty
-from sb3_cpm.world_model.observations import how_to_be_read, unread
+from sb3_cpm.world_model.observations import how_to_be_read, is_vector, unread
 
 _PARENTHESES = (
     "The callback is the class ChallengerCallback instead of one of its kind: write learn(..., "
@@ -285,7 +285,10 @@ class ChallengerCallback(BaseCallback):
             return
         self._told_unread = True
         assert self.challenger is not None
+        images_only = not self.challenger.preset["read_vectors"]  # then vectors are left out on purpose
         for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
+            if images_only and is_vector(space):
+                continue
             if player_keys is None or key in player_keys:
                 what = f"The challenger cannot read {key!r} ({space}), so for it no state is new because of that."
                 cure = how_to_be_read(space)

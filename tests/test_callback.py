@@ -112,7 +112,7 @@ def test_going_on_without_the_buffer(tmp_path):
     model.learn(150, callback=make_callback())
     model.save(tmp_path / "model")
     resumed = SAC.load(tmp_path / "model", env=toy())
-    with pytest.raises(ValueError, match="Set learning_starts=200 or more, or go on with the buffer"):
+    with pytest.raises(ValueError, match="load_replay_buffer.* or begin with new experience: learning_starts=200"):
         resumed.learn(100, callback=make_callback(), reset_num_timesteps=False)
     resumed.learning_starts = 200
     resumed.learn(100, callback=make_callback(decay_steps=250), reset_num_timesteps=False)

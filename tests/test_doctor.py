@@ -83,7 +83,7 @@ importlib.util.find_spec = lambda name: None if name in ("mani_skill", "sapien")
 try:
     sb3_cpm.envs.make_maniskill_env("PickCube-v1")
 except ImportError as error:
-    assert "pip install 'sb3_cpm[maniskill]'" in str(error), error
+    assert 'pip install "sb3_cpm[maniskill]"' in str(error), error
     print("said so")
 """
     child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=600)

@@ -183,7 +183,7 @@ def test_running_episodes_end_where_somebody_else_uses_the_environment(learn, wh
 def test_an_evaluation_between_two_portions_of_learning():
     env = DummyVecEnv([Counter])
     model = sac(env, n_steps=45)
-    callback = ChallengerCallback(SMALL)
+    callback = ChallengerCallback(SMALL, decay="constant")
     for portion in range(3):
         model.learn(16, callback=callback, reset_num_timesteps=False)
         if portion == 1:

@@ -651,6 +651,7 @@ def train(folder: Path, n_timesteps: int, **kwargs: Any) -> tuple[Any, Any]:
     return made[0], (manager, start)
 
 
+@pytest.mark.filterwarnings("ignore:The exploration probability had fallen:UserWarning")  # told of in a test of its own
 @pytest.mark.slow
 def test_a_continued_run_goes_on_with_everything(tmp_path: Path) -> None:
     model, (manager, start) = train(tmp_path, 300, save_freq=100, eval_freq=100, n_eval_episodes=1)

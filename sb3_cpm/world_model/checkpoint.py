@@ -68,8 +68,11 @@ def is_model(path: str | os.PathLike) -> bool:
     """Whether a file is a model of SB3. torch's own files are zip archives too, with other members."""
     if not Path(path).is_file() or not zipfile.is_zipfile(path):
         return False
-    with zipfile.ZipFile(path) as archive:
-        return {"data", "policy.pth"} <= set(archive.namelist())
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {"data", "policy.pth"} <= set(archive.namelist())
+    except zipfile.BadZipFile:  # damaged, whatever it was
+        return False
 
 
 def check_storable(name: str, values: Mapping[str, Any]) -> None:
