@@ -1,7 +1,7 @@
 """What a :class:`~sb3_cpm.buffers.CPMBuffer` cannot work with, said in words."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,12 @@ def check_spaces(observation_space: spaces.Space, n_sampled_goal: int, player_ke
             f"n_sampled_goal={n_sampled_goal} asks for hindsight goals, but the observations have no {sorted(missing)}; "
             "use n_sampled_goal=0 on an environment without goals."
         )
-    unknown = set(player_keys or ()) - set(observation_space.spaces)
+    if player_keys is not None and (
+        isinstance(player_keys, str) or not isinstance(player_keys, Collection) or not player_keys
+    ):
+        known = sorted(observation_space.spaces)
+        raise ValueError(f"player_keys must be a list of observation keys, of {known}, or None for all, got {player_keys!r}.")
+    unknown = {str(key) for key in player_keys or ()} - set(observation_space.spaces)
     if unknown:
         known = sorted(observation_space.spaces)
         raise ValueError(f"player_keys {sorted(unknown)} are not among the observation keys {known}")
