@@ -6,6 +6,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
@@ -18,6 +19,7 @@ from sb3_cpm.envs import DictObservation, rendering
 from sb3_cpm.envs.suites import register_suite
 from sb3_cpm.extras import MissingExtra, check_installed, needed
 from sb3_cpm.presets import make_preset
+from sb3_cpm.world_model.observations import ObservationSpec
 from sb3_cpm.zoo import __main__ as zoo_cli
 from sb3_cpm.zoo.wrappers import TerminationIsSuccess, as_dict
 
@@ -412,3 +414,18 @@ def test_suites_that_are_missing(env_id, module, monkeypatch):
     monkeypatch.delitem(gym.registry, env_id, raising=False)
     with pytest.raises(MissingExtra, match=rf'Tasks such as {env_id} need .*pip install "sb3_cpm\[benchmarks\]"'):
         register_suite(env_id)
+
+
+def test_an_image_whose_smallest_side_is_in_the_middle_has_its_channels_last():
+    spec = ObservationSpec(spaces.Dict({"strip": spaces.Box(0, 255, (8, 1, 2), np.uint8)}))
+    assert spec.image_shape == (2, 8, 1)
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 1, 2), dtype=np.uint8)
+    back = spec.split(spec.preprocess({"strip": images}, th.device("cpu")), (3,))["strip"]
+    assert np.allclose(back.numpy(), images, atol=1e-3)
+
+
+def test_numbers_beyond_float32_are_refused_and_infinite_ones_are_left_to_others():
+    spec = ObservationSpec(spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (2,), np.float64)}), squash=False)
+    with pytest.raises(ValueError, match="'state' holds 1e\\+300, beyond float32.*Scale it"):
+        spec.preprocess({"state": np.array([[1e300, 0.0]])}, th.device("cpu"))
+    assert spec.preprocess({"state": np.array([[np.inf, 1.0]])}, th.device("cpu")).vectors is not None

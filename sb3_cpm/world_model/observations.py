@@ -133,7 +133,7 @@ class ObservationSpec:
                 f"Images of unequal size cannot be stacked ({listing}). Render all cameras at one size, or pass `keys` "
                 "with cameras of one size only."
             )
-        self.channels = [min(self.shapes[key]) for key in self.image_keys]
+        self.channels = [self.shapes[key][0 if self._channel_first(key) else -1] for key in self.image_keys]
         height, width = sizes[self.image_keys[0]]
         return sum(self.channels), height, width
 
@@ -178,6 +178,11 @@ class ObservationSpec:
         if key not in observations:
             raise ValueError(f"Observation key {key!r} is missing, got {sorted(observations)}.")
         tensor = to_tensor(observations[key], device)
+        if tensor.dtype == torch.float64 and bool((tensor.isfinite() != tensor.float().isfinite()).any()):
+            raise ValueError(
+                f"Observation {key!r} holds {tensor.abs().amax():.3g}, beyond float32, in which networks compute. Scale it in "
+                "a wrapper, for example with gymnasium's TransformObservation."
+            )
         shape = self.shapes[key]
         if tuple(tensor.shape[-len(shape) :]) != shape:
             raise ValueError(
