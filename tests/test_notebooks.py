@@ -2,6 +2,7 @@
 
 import ast
 import base64
+import contextlib
 import importlib
 import os
 import re
@@ -12,6 +13,7 @@ import pytest
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
+run_sync = pytest.importorskip("jupyter_core.utils").run_sync
 pytest.importorskip("ipykernel")
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
@@ -98,9 +100,10 @@ def test_figures_are_explained(path):
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
+def living_client(tmp_path_factory):
     """
-    Of one kernel for all notebooks: a minute would be spent on importing PyTorch and ManiSkill ten times.
+    Finds the client of one kernel for all notebooks: a minute would be spent on importing PyTorch and ManiSkill ten times. Of
+    a new one where the last has died: only the notebook that it died of fails.
 
     A process that the machine has no time for must not look like one that failed: alone, notebook 05 trains all five agents in
     one cell, 40 CPU seconds, and on a machine that many share that was more than the ten minutes that a cell had. So limits
@@ -111,14 +114,25 @@ def client(tmp_path_factory):
     search = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, "PYTHONPATH": search, "SB3_CPM_QUICK": "1", "SB3_CPM_RESULTS": str(results)}
     environment.pop("MPLBACKEND", None)  # Jupyter's own
-    client = nbclient.NotebookClient(
-        nbformat.v4.new_notebook(),
-        kernel_name="python3",
-        **dict.fromkeys(("timeout", "startup_timeout", "iopub_timeout"), SECONDS),
-        raise_on_iopub_timeout=True,  # else outputs that come later are lost without a word
-    )
-    with client.setup_kernel(env=environment):
-        yield client
+    clients = []
+
+    def start():
+        client = nbclient.NotebookClient(
+            nbformat.v4.new_notebook(),
+            kernel_name="python3",
+            **dict.fromkeys(("timeout", "startup_timeout", "iopub_timeout"), SECONDS),
+            raise_on_iopub_timeout=True,  # else outputs that come later are lost without a word
+        )
+        stack.enter_context(client.setup_kernel(env=environment))
+        return client
+
+    def find():
+        if not clients or not run_sync(clients[-1].kc.is_alive)():
+            clients.append(start())
+        return clients[-1]
+
+    with contextlib.ExitStack() as stack:
+        yield find
 
 
 @pytest.mark.slow
@@ -130,7 +144,7 @@ def client(tmp_path_factory):
     ],
 )
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning", "ignore::RuntimeWarning:zmq.*")
-def test_runs_from_a_clean_kernel(path, tmp_path, client):
+def test_runs_from_a_clean_kernel(path, tmp_path, living_client):
     copy = tmp_path / "notebooks" / path.name
     copy.parent.mkdir()
     shutil.copy(path, copy)
@@ -138,6 +152,7 @@ def test_runs_from_a_clean_kernel(path, tmp_path, client):
     for cell in notebook.cells:  # a clean one: nothing is left of what is stored
         if cell.cell_type == "code":
             cell.outputs, cell.execution_count = [], None
+    client = living_client()
     # nor of the notebook before, but for what it imported
     clean = f"import os; os.chdir({str(copy.parent)!r}); get_ipython().reset()"
     reply = client.wait_for_reply(client.kc.execute(clean, silent=True))

@@ -26,9 +26,12 @@ class WarmPython:
     """The side of the tests: starts it, and hands it commands."""
 
     def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def _start(self) -> "subprocess.Popen[str]":
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
         command = [sys.executable, "-W", "ignore", __file__]
-        self._process = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def run(self, module: str, arguments: list[str], folder: Path, timeout: float = 900) -> "subprocess.CompletedProcess[str]":
         """
@@ -36,6 +39,8 @@ class WarmPython:
 
         :param timeout: seconds until it is killed
         """
+        if self._process is None or self._process.poll() is not None:  # one that was killed fails the test that it was at
+            self._process = self._start()
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
         with tempfile.TemporaryDirectory() as outputs:
@@ -49,7 +54,8 @@ class WarmPython:
             return subprocess.CompletedProcess([module, *arguments], status, *(file.read_text() for file in files))
 
     def close(self) -> None:
-        self._process.communicate()  # it ends where its input does
+        if self._process is not None:
+            self._process.communicate()  # it ends where its input does
 
 
 def serve() -> None:
