@@ -49,8 +49,10 @@ class WarmPython:
             requests.flush()
             limit = threading.Timer(timeout, os.kill, (int(answers.readline()), signal.SIGKILL))
             limit.start()
-            status = int(answers.readline())
-            limit.cancel()
+            try:
+                status = int(answers.readline())
+            finally:
+                limit.cancel()  # also where there is no answer: the number may be another process's by then
             return subprocess.CompletedProcess([module, *arguments], status, *(file.read_text() for file in files))
 
     def close(self) -> None:
