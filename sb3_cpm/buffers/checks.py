@@ -244,7 +244,9 @@ def checked_actions(action: Any, n_envs: int, space: spaces.Space, action_dim: i
             "per environment, scaled to [-1, 1] as policy.scale_action() does."
         )
     if isinstance(space, spaces.Box):
-        if not (array.min(initial=0.0) >= -1.001 and array.max(initial=0.0) <= 1.001):  # NaN fails too
+        # by hand they may come in the environment's units, as in SB3's own tests of its buffers
+        low, high = min(-1.001, float(space.low.min())), max(1.001, float(space.high.max()))
+        if not (array.min(initial=0.0) >= low and array.max(initial=0.0) <= high):  # NaN fails too
             raise ValueError(
                 f"Actions must be finite and lie within [-1, 1], got {array.tolist()}: scale them from the environment's "
                 "units with policy.scale_action(), as SB3 does."
