@@ -19,44 +19,29 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 
 HERE = Path(__file__).resolve().parents[1]
-ACTIONS = {"vector": 1, "cameras": 7}
-
-
-def space(kind: str) -> spaces.Dict:
-    if kind == "vector":
-        return spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (2,), np.float32)})
-    camera = spaces.Box(0, 255, (32, 32, 3), np.uint8)
-    return spaces.Dict({"base": camera, "hand": camera, "state": spaces.Box(-np.inf, np.inf, (29,), np.float32)})
+#: Number of cameras, size of the state, size of the action.
+SIZES = {"vector": (0, 2, 1), "cameras": (2, 29, 7)}
 
 
 def measure(kind: str, updates: int) -> dict[str, float]:
     """:return: CPU milliseconds of the median update, and tensor operations"""
+    from world_model import make_batch, make_space
+
     from sb3_cpm.challenger import Challenger
-    from sb3_cpm.type_aliases import SequenceBatch
 
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
-    challenger = Challenger(space(kind), spaces.Box(-1.0, 1.0, (ACTIONS[kind],), np.float32), "cpu")
-    rng, shape = np.random.default_rng(0), (challenger.sequence_length, challenger.batch_size)
-    observations: dict[str, Any] = {
-        key: rng.integers(0, 256, (*shape, *sub.shape), dtype=np.uint8)
-        if sub.dtype == np.uint8
-        else rng.normal(size=(*shape, *(sub.shape or ()))).astype(np.float32)
-        for key, sub in space(kind).items()
-    }
-    first = np.zeros(shape, bool)
-    first[0] = True
-    actions = rng.uniform(-1, 1, (*shape, ACTIONS[kind])).astype(np.float32) * ~first[..., None]
-    rewards = rng.uniform(size=shape).astype(np.float32) * ~first
-    batch = SequenceBatch(observations, actions, rewards, first, np.zeros(shape, bool), np.ones(shape, bool))
+    cameras, state_dim, action_dim = SIZES[kind]
+    space = make_space(32, cameras, state_dim)
+    challenger = Challenger(space, spaces.Box(-1.0, 1.0, (action_dim,), np.float32), "cpu")
+    batch = make_batch(space, challenger.preset, action_dim)
     for _ in range(3):
         challenger.train(batch)
     seconds = []
@@ -83,7 +68,7 @@ def main() -> None:
     parser.add_argument("--against", type=Path, help="another checkout")
     parser.add_argument("--turns", type=int, default=4)
     parser.add_argument("--updates", type=int, default=25, help="per turn")
-    parser.add_argument("--measure", choices=list(ACTIONS), help=argparse.SUPPRESS)
+    parser.add_argument("--measure", choices=list(SIZES), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.measure:
         print(json.dumps(measure(args.measure, args.updates)))
@@ -91,7 +76,7 @@ def main() -> None:
     checkouts = {"this": HERE} | ({"other": args.against.resolve()} if args.against else {})
     print("| default preset, on | checkout | CPU ms | least | tensor operations | this / other |")
     print("| --- | --- | --- | --- | --- | --- |")
-    for kind in ACTIONS:
+    for kind in SIZES:
         found: dict[str, list[dict[str, float]]] = {name: [] for name in checkouts}
         for _ in range(args.turns):
             for name, checkout in checkouts.items():

@@ -95,13 +95,13 @@ class Pair(NamedTuple):
 
 
 # ---------------------------------------------------------------------- contestants
-def make_space(size: int, cameras: int) -> spaces.Dict:
+def make_space(size: int, cameras: int, state_dim: int = STATE_DIM) -> spaces.Dict:
     """So many cameras of ``size`` x ``size``, and a state vector."""
     images = {f"camera{i}": spaces.Box(0, 255, (size, size, 3), np.uint8) for i in range(cameras)}
-    return spaces.Dict({**images, "state": spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)})
+    return spaces.Dict({**images, "state": spaces.Box(-np.inf, np.inf, (state_dim,), np.float32)})
 
 
-def make_batch(space: spaces.Dict, preset: dict[str, Any]) -> SequenceBatch:
+def make_batch(space: spaces.Dict, preset: dict[str, Any], action_dim: int = ACTION_DIM) -> SequenceBatch:
     """Whole sequences of noise; what is in them does not change what they cost."""
     rng = np.random.default_rng(0)
     shape = preset["sequence_length"], preset["batch_size"]
@@ -114,7 +114,7 @@ def make_batch(space: spaces.Dict, preset: dict[str, Any]) -> SequenceBatch:
     }
     is_first = np.zeros(shape, bool)
     is_first[0] = True
-    actions = rng.uniform(-1, 1, (*shape, ACTION_DIM)).astype(np.float32) * ~is_first[..., None]
+    actions = rng.uniform(-1, 1, (*shape, action_dim)).astype(np.float32) * ~is_first[..., None]
     rewards = rng.uniform(size=shape).astype(np.float32) * ~is_first
     return SequenceBatch(observations, actions, rewards, is_first, np.zeros(shape, bool), np.ones(shape, bool))
 

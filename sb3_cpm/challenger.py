@@ -46,7 +46,7 @@ class Challenger:
     :param observation_space: Dict space; images (3-D, with finite bounds) and vectors (1-D) are read
     :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
     :param device: "auto" takes the GPU where there is one
-    :param preset: "default", "report", "report_images", or a dict of entries, see :mod:`sb3_cpm.presets`
+    :param preset: "default", "dreamer", "report", "report_images", or a dict of entries, see :mod:`sb3_cpm.presets`
     :param keys: the observation keys to read; all images, and vectors unless the preset leaves them out, by default
     :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
         :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
@@ -211,7 +211,7 @@ class Challenger:
         :param deterministic: the policy's mode instead of a sample
         :param behavior: "exploration" or "task"
         :param noise: standard normal numbers that the samples are made of, shape ``(n, action_dim)``, such as those of
-            :class:`~sb3_cpm.world_model.perseverance.CorrelatedNoise`; drawn anew where None
+            :class:`~sb3_cpm.world_model.correlated_noise.CorrelatedNoise`; drawn anew where None
         :return: shape ``(n, action_dim)``, within [-1, 1]
         :raises ValueError: for a behaviour that it does not have
         """

@@ -24,7 +24,7 @@ from sb3_cpm.buffers.episode_buffer import NEXT_OBSERVATION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.training_env import WatchedVecEnv
-from sb3_cpm.world_model.perseverance import CorrelatedNoise
+from sb3_cpm.world_model.correlated_noise import CorrelatedNoise
 
 ExplorationUnit = Literal["step", "segment", "episode"]
 

@@ -11,8 +11,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
+from gymnasium.utils import seeding
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_cpm.envs import vulkan
@@ -36,8 +38,18 @@ LONGEST = (
 
 
 @pytest.fixture(autouse=True)
-def _same_seed() -> None:
+def _same_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """
+    What is drawn is the same in every run. Gymnasium's spaces and environments draw from generators of their own, which take
+    their seed from the operating system unless they are given one: here from NumPy's global generator.
+    """
     set_random_seed(0)
+
+    def np_random(seed: int | None = None) -> tuple[np.random.Generator, int]:
+        return unseeded(int(np.random.randint(2**31)) if seed is None else seed)
+
+    unseeded = seeding.np_random
+    monkeypatch.setattr(seeding, "np_random", np_random)
 
 
 # ---------------------------------------------------------------------- several processes

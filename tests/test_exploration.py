@@ -12,7 +12,7 @@ from sb3_cpm.buffers import EXECUTED_ACTION
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.envs.wrappers import DictObservation
 from sb3_cpm.exploration import ExplorationVecEnv, make_decay
-from sb3_cpm.world_model.perseverance import CorrelatedNoise
+from sb3_cpm.world_model.correlated_noise import CorrelatedNoise
 
 TINY = dict(batch_size=2, sequence_length=8, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=8, hidden_size=16)
 NAMES = ["constant", "linear", "exponential", "inverse_time", "cosine", "logistic"]

@@ -41,8 +41,8 @@ from sb3_cpm.presets import make_preset
 from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.checkpoint import state_to_check
+from sb3_cpm.world_model.correlated_noise import CorrelatedNoise
 from sb3_cpm.world_model.observations import check_action_space, how_to_be_read, unread
-from sb3_cpm.world_model.perseverance import CorrelatedNoise
 
 #: Arguments of the constructors that SB3's ``load`` would only set as attributes, which nobody reads.
 _OF_CONSTRUCTOR = ("preset", "keys", "start_from", "uncertainty_class", "uncertainty_kwargs", "train_task_behavior")

@@ -23,7 +23,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_cpm.world_model.activation import tanh_
 from sb3_cpm.world_model.distributions import GaussianLatent, OutputSampler, TruncatedNormal
-from sb3_cpm.world_model.scan import gate_slopes, norm_backward
+from sb3_cpm.world_model.scan import gate_slopes, norm_backward, rows_weight_gradient
 
 
 class Dynamics(NamedTuple):
@@ -176,6 +176,5 @@ class Dream(torch.autograd.Function):
                 g_deter = g_memory.addcmul_(g_deter, remembered[t]).add_(g_remembered)
         found: list[torch.Tensor] = []
         for to_value, inputs in zip(to_values, [here, *values[:-1]], strict=True):
-            rows_of_gradient = to_value.flatten(0, 1)
-            found += [rows_of_gradient.t() @ inputs.flatten(0, 1), rows_of_gradient.sum(0)]
+            found += [rows_weight_gradient(to_value, inputs), to_value.sum((0, 1))]
         return None, None, None, None, *found

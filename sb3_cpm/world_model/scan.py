@@ -148,12 +148,12 @@ class Scan(torch.autograd.Function):
                 g_stoch.masked_fill_(first[t], 0.0)
         _, g_norm, g_norm_bias = norm_backward(g_all_gates, products, mean, spread, *norm, (False, True, True))
         gradients = Weights(
-            _weight_gradient(g_all_a, befores),
-            _weight_gradient(g_all_products, inputs),
+            rows_weight_gradient(g_all_a, befores),
+            rows_weight_gradient(g_all_products, inputs),
             g_norm,
             g_norm_bias,
-            _weight_gradient(g_all_posteriors, deters),
-            _weight_gradient(g_all_stats, posteriors),
+            rows_weight_gradient(g_all_posteriors, deters),
+            rows_weight_gradient(g_all_stats, posteriors),
             g_all_stats.sum((0, 1)),
         )
         return None, None, None, None, None, g_all_a, g_all_posteriors, *gradients
@@ -200,6 +200,12 @@ def norm_backward(
     return torch.ops.aten.native_layer_norm_backward(gradient, inputs, shape, mean, spread, gain, bias, list(wanted))
 
 
-def _weight_gradient(gradients: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
-    """Of a layer's weight, over all rows."""
+def rows_weight_gradient(gradients: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+    """
+    Gradient of a layer's weight, over all steps and columns.
+
+    :param gradients: of the layer's output, shape ``(L, n, size_out)``
+    :param inputs: shape ``(L, n, size_in)``
+    :return: shape ``(size_out, size_in)``
+    """
     return gradients.flatten(0, 1).t() @ inputs.flatten(0, 1)
