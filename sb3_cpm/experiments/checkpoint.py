@@ -27,10 +27,10 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cpm.buffers import EpisodeBuffer
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.experiments.stored_run import DamagedRunError
+from sb3_cpm.run.stored_run import DamagedRunError
 from sb3_cpm.files import Archive, DamagedFileError, disk_errors_named, verify, write_archive
 from sb3_cpm.packing import pack, unpack
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.run.specification import FIRST_SEED
 from sb3_cpm.run.folder import save_model
 
 NAME = "checkpoint"
