@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_cpm.experiments.specification import Experiment, options_of
-from sb3_cpm.experiments.stored_run import DamagedRunError, StoredRun, read_run
+from sb3_cpm.experiments.stored_run import StoredRun, read_run
 from sb3_cpm.experiments.tables import COLUMNS
+from sb3_cpm.files import DamagedRunError
 
 IDENTITY = ["agent", "env", "seed"]
 #: Of what a run was made with, what agents that are drawn together should have in common.

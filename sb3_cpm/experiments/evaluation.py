@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
 class Outcome(NamedTuple):

@@ -23,7 +23,7 @@ from sb3_cpm import __version__
 from sb3_cpm.experiments.specification import RunSpec, fingerprint
 from sb3_cpm.files import LockedError, locked, write_text
 from sb3_cpm.run.folder import versions, write_yaml
-from sb3_cpm.run.settings import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 if TYPE_CHECKING:
     from sb3_cpm.zoo.agents import Agent

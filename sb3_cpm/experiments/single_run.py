@@ -12,18 +12,18 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import __version__
+from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.experiments import checkpoint as checkpoints
 from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.diagnostics import DiagnosticsWriter
 from sb3_cpm.experiments.evaluation import evaluate, success_of
 from sb3_cpm.experiments.player_losses import log_player_losses
 from sb3_cpm.experiments.specification import RunResult, RunSpec
-from sb3_cpm.experiments.stored_run import DamagedRunError, read_run
+from sb3_cpm.experiments.stored_run import read_run
 from sb3_cpm.experiments.tables import COLUMNS, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
-from sb3_cpm.files import DamagedFileError, NotFiniteError, NotWrittenError, locked
-from sb3_cpm.run.settings import check_seed
+from sb3_cpm.files import DamagedFileError, DamagedRunError, NotFiniteError, NotWrittenError, locked
+from sb3_cpm.seeds import check_seed
 from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.

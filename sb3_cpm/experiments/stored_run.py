@@ -14,10 +14,7 @@ import pandas as pd
 from sb3_cpm.experiments.run_folder import CONFIG, CRASHED, FINISHED, is_finished, read_yaml
 from sb3_cpm.experiments.specification import fingerprint
 from sb3_cpm.experiments.tables import COLUMNS
-
-
-class DamagedRunError(ValueError):
-    """The files of a run are not what a run leaves."""
+from sb3_cpm.files import DamagedRunError
 
 
 class StoredRun(NamedTuple):

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.run.recorder import CSVTable
-from sb3_cpm.run.settings import FIRST_SEED as FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
 class EpisodeResult(NamedTuple):

@@ -1,4 +1,4 @@
-"""The folder that a run leaves: a name that is never taken twice, one process that writes it, and the model in it."""
+"""The folder that a run leaves: a name that is never taken twice, and one process that writes it."""
 
 import itertools
 import os
@@ -8,16 +8,13 @@ import sys
 from contextlib import ExitStack, suppress
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from sb3_cpm import __version__
-from sb3_cpm.files import LOCK, check_finite, disk_errors_named, locked, write_sealed, write_text
+from sb3_cpm.files import LOCK, disk_errors_named, locked, write_text
 from sb3_cpm.run.settings import TrainSettings
-
-if TYPE_CHECKING:  # whoever only reads results can do without
-    from stable_baselines3.common.base_class import BaseAlgorithm
 
 PACKAGES = (
     "stable_baselines3",
@@ -103,22 +100,6 @@ def _not_empty(folder: Path) -> str:
         f"The run folder {folder} exists and is not empty. Nothing is ever overwritten: choose another name with "
         f"--run-folder, leave it out to get the next free name, or remove {folder} yourself."
     )
-
-
-def save_model(path: Path, model: "BaseAlgorithm") -> None:
-    """
-    SB3's own archive, written whole, with a digest.
-
-    :param path: of the file
-    :param model: to save
-    :raises NotFiniteError: if a weight is not finite; the last good file stays
-    :raises NotWrittenError: if the disk does not take it; the last good file stays, too
-    """
-    from stable_baselines3.common.save_util import recursive_getattr
-
-    _, variables = model._get_torch_save_params()
-    check_finite(path, "model", {name: recursive_getattr(model, name, None) for name in variables} | model.get_parameters())
-    write_sealed(path, model.save)
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:

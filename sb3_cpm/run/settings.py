@@ -4,9 +4,9 @@ import re
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
+from sb3_cpm.seeds import check_seed
+
 ALGORITHMS = ("sac", "td3", "tqc")
-#: Evaluation seeds start here; training has those below.
-FIRST_SEED = 1_000_000
 
 #: What differs from the defaults below, for tasks that the package knows.
 TASK_DEFAULTS: dict[str, dict[str, Any]] = {
@@ -20,15 +20,6 @@ TASK_DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "CPMToy-v0": {"steps": 2000, "gamma": 0.9, "tau": 0.01},
 }
-
-
-def check_seed(seed: int, n_envs: int) -> None:
-    """:raises ValueError: for a seed of a run some of whose environments would have seeds of the evaluation"""
-    if not 0 <= seed < FIRST_SEED - n_envs:
-        raise ValueError(
-            f"seed={seed}: expected 0 or more, and less than {FIRST_SEED - n_envs}: the evaluation's episodes have the seeds "
-            "from there on, and training never sees these"
-        )
 
 
 @dataclass(frozen=True)

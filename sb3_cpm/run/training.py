@@ -26,6 +26,7 @@ from sb3_cpm.arguments import check_arguments
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
+from sb3_cpm.checkpoint import save_model
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import check_installed
 from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
@@ -33,12 +34,13 @@ from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
 from sb3_cpm.run.arguments import misspelt_names_told
 from sb3_cpm.run.environment import make_env, make_vec_env
-from sb3_cpm.run.evaluation import FIRST_SEED, Evaluator, play_episode, success_rate
+from sb3_cpm.run.evaluation import Evaluator, play_episode, success_rate
 from sb3_cpm.run.gallery import challenge_gallery
 from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.settings import TrainSettings
 from sb3_cpm.run.summary import NOT_TRAINING, Summary, complete_times, peak_memory_gb
 from sb3_cpm.run.video import write_video
+from sb3_cpm.seeds import FIRST_SEED
 
 #: Trajectories in the challenge gallery.
 N_SHOTS = 6
@@ -197,7 +199,7 @@ class Run:
         return summary
 
     def _save_model(self) -> None:
-        run_folder.save_model(self.folder / "model.zip", self.model)
+        save_model(self.folder / "model.zip", self.model)
 
     def _save_challenger(self) -> None:
         if self.challenger.challenger is not None:
