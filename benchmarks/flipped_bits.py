@@ -16,7 +16,7 @@ from typing import Any
 
 from sb3_cpm import CPMBuffer
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.experiments.checkpoint import find_checkpoint, save_checkpoint
+from sb3_cpm.checkpoint import find_checkpoint, save_checkpoint
 from sb3_cpm.zoo.agents import load_agent
 
 SMALL = {

@@ -31,7 +31,7 @@ from sb3_cpm.experiments.single_run import Watcher, perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.files import LockedError, locked
-from sb3_cpm.run.specification import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 from sb3_cpm.zoo.agents import load_agent
 
 TINY = {

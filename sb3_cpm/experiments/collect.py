@@ -1,6 +1,7 @@
 """The CSV files of an experiment as tables, with everything odd about them said."""
 
 import contextlib
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_cpm.experiments.specification import Experiment, options_of
-from sb3_cpm.run.stored_run import DamagedRunError, StoredRun, read_run
+from sb3_cpm.files import DamagedRunError
+from sb3_cpm.run.stored_run import StoredRun, read_run
 from sb3_cpm.run.tables import COLUMNS
 
 IDENTITY = ["agent", "env", "seed"]

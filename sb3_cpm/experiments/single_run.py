@@ -5,11 +5,12 @@ from pathlib import Path
 
 from sb3_cpm.experiments.specification import RunResult
 from sb3_cpm.experiments.twins import find_twin, take_over
-from sb3_cpm.files import locked
+from sb3_cpm.files import DamagedRunError, locked
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.execution import Run, RunOptions
-from sb3_cpm.run.specification import RunSpec, check_seed
-from sb3_cpm.run.stored_run import DamagedRunError, read_run
+from sb3_cpm.run.specification import RunSpec
+from sb3_cpm.run.stored_run import read_run
+from sb3_cpm.seeds import check_seed
 from sb3_cpm.zoo.agents import load_agent
 
 

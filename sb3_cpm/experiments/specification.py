@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from sb3_cpm.arguments import nearest
-from sb3_cpm.run.specification import FIRST_SEED, RunSpec
+from sb3_cpm.run.specification import RunSpec
+from sb3_cpm.seeds import FIRST_SEED
 
 #: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.
 VERSIONS = ("full", "short", "quick")

@@ -9,11 +9,11 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from sb3_cpm.run import folder as run_folder
 from sb3_cpm.experiments.specification import RunSpec
+from sb3_cpm.files import write_bytes
+from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.stored_run import read_run
 from sb3_cpm.run.tables import EVALUATIONS, Table
-from sb3_cpm.files import write_bytes
 
 
 def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:

@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_cpm.run.specification import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
 class Outcome(NamedTuple):
@@ -72,7 +72,7 @@ def _play(model: BaseAlgorithm, env: VecEnv, seed: int) -> Outcome:
 
 
 class _Filmed(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps a picture of every state: within a ``VecEnv``, which begins the next episode at once, nobody else sees the last."""
+    """Keeps a picture of every state: a ``VecEnv`` begins the next episode at once, and nobody else sees the last."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)

@@ -1,8 +1,8 @@
 """
 ONE run, for everybody who makes runs: ``train``, ``reproduce``, benchmarks.
 
-A folder that holds a checkpoint of the run is gone on with; tables then end as an unbroken run's do, bit for bit. Whatever ends
-a run (the last step, Ctrl-C, SIGTERM, an exception, a full disk), what was written stays whole, and the environments are closed.
+A folder that holds a checkpoint of the run is gone on with; tables then end as an unbroken run's do, bit for bit. Whatever
+ends a run (the last step, Ctrl-C, SIGTERM, an exception), what was written stays whole, and the environments are closed.
 """
 
 import contextlib
@@ -23,12 +23,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import __version__
+from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.buffers import CPMBuffer
-from sb3_cpm.experiments import checkpoint as checkpoints
-from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
+from sb3_cpm.files import DamagedRunError, NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.specification import RunSpec
-from sb3_cpm.run.stored_run import DamagedRunError
 from sb3_cpm.run.summary import NOT_TRAINING, Summary, complete_times, evaluated, peak_memory_gb
 from sb3_cpm.run.watcher import Watcher
 from sb3_cpm.zoo.agents import Agent, Built
@@ -81,7 +80,7 @@ class Run:
         spec: RunSpec,
         agent: Agent,
         folder: Path,
-        options: RunOptions = RunOptions(),  # noqa: B008  # frozen
+        options: RunOptions = RunOptions(),  # frozen
         tell: Callable[[str], None] = lambda news: None,
     ) -> None:
         self._started = time.perf_counter()
@@ -89,7 +88,7 @@ class Run:
         self.title = f"{agent.name} on {agent.env_id}, seed {spec.seed}"
         check_device(options.device)
         th.set_num_threads(options.threads)
-        th.set_flush_denormal(True)  # Adam's averages of units that are off decay to numbers that cost CPUs a tenth of an update
+        th.set_flush_denormal(True)  # Adam's averages of units that are off decay to numbers that CPUs take long for
         self.found = checkpoints.find_checkpoint(folder)
         if self.found is not None and not (folder / run_folder.CONFIG).exists():
             raise DamagedRunError(
@@ -160,7 +159,7 @@ class Run:
         with self.watcher.stopwatch.section("pictures and saving"):
             for what, job in jobs:
                 _attempt(what, job)
-        summary = self._summary(outcome)
+        summary = self.summary = self._summary(outcome)
         if self.options.pictures and begun:
             _attempt("the summary", lambda: summary.write(self.folder))
         if finished:  # last: a process that is killed before goes on
@@ -186,7 +185,7 @@ class Run:
         return drawings
 
     def _save_model(self) -> None:
-        run_folder.save_model(self.folder / "model.zip", self.model)
+        checkpoints.save_model(self.folder / "model.zip", self.model)
 
     def _save_challenger(self) -> None:
         callback = self.watcher.challenger
@@ -256,8 +255,8 @@ def check_length(spec: RunSpec, model: Any) -> None:
     first = getattr(model, "learning_starts", 0)
     if spec.steps <= first:
         raise ValueError(
-            f"steps={spec.steps} is no longer than learning_starts={first}, the steps before the first update: nothing would be "
-            f"learned. Set steps above {first}, or learning_starts lower."
+            f"steps={spec.steps} is no longer than learning_starts={first}, the steps before the first update: nothing would "
+            f"be learned. Set steps above {first}, or learning_starts lower."
         )
 
 

@@ -27,12 +27,11 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from sb3_cpm import __version__
-from sb3_cpm.files import LOCK, LockedError, check_finite, disk_errors_named, locked, write_sealed, write_text
-from sb3_cpm.run.specification import FIRST_SEED, RunSpec, fingerprint
+from sb3_cpm.files import LOCK, LockedError, disk_errors_named, locked, write_text
+from sb3_cpm.run.specification import RunSpec, fingerprint
+from sb3_cpm.seeds import FIRST_SEED
 
 if TYPE_CHECKING:  # whoever only reads results can do without
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
     from sb3_cpm.zoo.agents import Agent
 
 CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
@@ -257,22 +256,6 @@ def _not_empty(folder: Path) -> str:
         f"--run-folder, leave it out to get the next free name, or remove {folder} yourself. A run that was cut off goes on "
         f"with --resume {folder}."
     )
-
-
-def save_model(path: Path, model: "BaseAlgorithm") -> None:
-    """
-    SB3's own archive, written whole, with a digest.
-
-    :param path: of the file
-    :param model: to save
-    :raises NotFiniteError: if a weight is not finite; the last good file stays
-    :raises NotWrittenError: if the disk does not take it; the last good file stays, too
-    """
-    from stable_baselines3.common.save_util import recursive_getattr
-
-    _, variables = model._get_torch_save_params()
-    check_finite(path, "model", {name: recursive_getattr(model, name, None) for name in variables} | model.get_parameters())
-    write_sealed(path, model.save)
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:

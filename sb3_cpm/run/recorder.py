@@ -99,7 +99,8 @@ class Recorder(BaseCallback):
         self._actions: list[int] = state.get("actions", [0, 0])
         self._recent: list[int] = state.get("recent", [0, 0])
         tables = state.get("tables", {})
-        self._tables = {name: GrownTable(folder / f"{name}.csv", **tables.get(name, {})) for name in ("proposals", "coefficients")}
+        names = ("proposals", "coefficients")
+        self._tables = {name: GrownTable(folder / f"{name}.csv", **tables.get(name, {})) for name in names}
         self._episode_ended: bool = state.get("episode_ended", False)
 
     @property

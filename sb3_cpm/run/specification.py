@@ -6,8 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-#: Evaluation seeds start here; training has those below.
-FIRST_SEED = 1_000_000
+from sb3_cpm.seeds import FIRST_SEED
 
 
 @dataclass(frozen=True)
@@ -28,6 +27,7 @@ class RunSpec:
     :param eval_seed: of the first of them, the others' follow
     :param checkpoint_every: environment steps between two checkpoints, each of which begins new episodes; None: one at each
         evaluation
+    :param module: what is to be imported first, because it registers the task
     """
 
     experiment: str
@@ -42,6 +42,7 @@ class RunSpec:
     eval_episodes: int = 5
     eval_seed: int = FIRST_SEED
     checkpoint_every: int | None = None
+    module: str = ""
 
     @property
     def name(self) -> str:
@@ -63,12 +64,3 @@ def fingerprint(protocol: dict[str, Any]) -> str:
     :return: twelve characters that differ whenever it does
     """
     return hashlib.sha256(json.dumps(protocol, sort_keys=True, default=str).encode()).hexdigest()[:12]
-
-
-def check_seed(seed: int, n_envs: int) -> None:
-    """:raises ValueError: for a seed of a run some of whose environments would have seeds of the evaluation"""
-    if not 0 <= seed < FIRST_SEED - n_envs:
-        raise ValueError(
-            f"seed={seed}: expected 0 or more, and less than {FIRST_SEED - n_envs}: the evaluation's episodes have the seeds "
-            "from there on, and training never sees these"
-        )

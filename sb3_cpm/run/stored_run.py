@@ -10,13 +10,10 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from sb3_cpm.files import DamagedRunError
 from sb3_cpm.run.folder import CONFIG, CRASHED, FINISHED, is_finished, read_yaml
 from sb3_cpm.run.specification import fingerprint
 from sb3_cpm.run.tables import COLUMNS
-
-
-class DamagedRunError(ValueError):
-    """The files of a run are not what a run leaves."""
 
 
 class StoredRun(NamedTuple):

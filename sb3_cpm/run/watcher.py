@@ -10,15 +10,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.experiments import checkpoint as checkpoints
-from sb3_cpm.files import DamagedFileError, NotFiniteError, NotWrittenError
+from sb3_cpm.files import DamagedFileError, DamagedRunError, NotFiniteError, NotWrittenError
 from sb3_cpm.run.diagnostics import DiagnosticsWriter
 from sb3_cpm.run.evaluation import Outcome, evaluate, success_of
 from sb3_cpm.run.player_losses import log_player_losses
 from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.specification import RunSpec
-from sb3_cpm.run.stored_run import DamagedRunError
 from sb3_cpm.run.tables import COLUMNS, Table
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.zoo.agents import Built

@@ -10,8 +10,11 @@ overridden in depth, and nothing is written.
 import argparse
 import contextlib
 import copy
+import functools
+import importlib.util
 import io
-from collections.abc import Callable, Mapping
+import signal
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,11 +22,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_cpm.arguments import nearest
+from sb3_cpm.envs.robust import RobustSubprocVecEnv
 from sb3_cpm.envs.suites import register_suite
 from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
+from sb3_cpm.zoo.registration import NAMESPACE, TASKS, knows_task, make_task, register_task
 
 
 class Built(NamedTuple):
@@ -33,13 +39,14 @@ class Built(NamedTuple):
     :param model: the SB3 model
     :param callbacks: those of the configuration, in its order; empty where it names none
     :param env: the training environments of the model
-    :param make_eval_env: makes one further environment with the same wrappers, in a VecEnv of its own
+    :param make_eval_env: makes one further environment with the same wrappers, in a ``DummyVecEnv`` of its own; with
+        ``render=True`` one that gives pictures, where it can
     """
 
     model: BaseAlgorithm
     callbacks: list[BaseCallback]
     env: VecEnv
-    make_eval_env: Callable[[], VecEnv]
+    make_eval_env: Callable[..., VecEnv]
 
 
 @dataclass(frozen=True)
@@ -84,12 +91,15 @@ class Agent:
         :param seed: rules model and environments
         :param n_envs: parallel environments; None: as the configuration says
         :param device: PyTorch device
-        :param vec_env_type: ``"dummy"`` or ``"subproc"``
+        :param vec_env_type: ``"dummy"``, ``"subproc"``, or ``"robust"``: in processes of their own, of which one that dies is
+            replaced
         :param load_path: go on with this saved model instead of making a new one
         :return: model, callbacks and environments
         :raises ValueError: where the algorithm, a wrapper or the environment refuses its arguments
         """
-        manager, hyperparameters = self._manager(seed, device, vec_env_type)
+        manager, hyperparameters = self._manager(seed, device, "dummy" if vec_env_type == "robust" else vec_env_type)
+        if vec_env_type == "robust":
+            manager.vec_env_class = functools.partial(_robust, seed)
         env = _quietly(manager.create_envs, n_envs or manager.n_envs, no_log=True)
         try:
             hyperparameters = _quietly(manager._preprocess_action_noise, hyperparameters, {}, env)
@@ -102,7 +112,10 @@ class Agent:
             env.close()
             raise
 
-        def make_eval_env() -> VecEnv:
+        def make_eval_env(render: bool = False) -> VecEnv:
+            manager.vec_env_class = DummyVecEnv
+            if render and can_render(self.env_id):
+                manager.eval_env_kwargs = {**manager.eval_env_kwargs, "render_mode": "rgb_array"}
             return _quietly(manager.create_envs, 1, eval_env=True, no_log=True)
 
         return Built(model, manager.callbacks, env, make_eval_env)
@@ -202,6 +215,49 @@ def algorithm_of(name: str) -> str:
     return max(matches, key=len)  # ppo_lstm, not ppo
 
 
+def imported(module: str, env_id: str) -> None:
+    """
+    gymnasium's ``MODULE:ID``: import what registers a task.
+
+    :param module: its name; "" for nothing
+    :param env_id: the task
+    :raises ValueError: if there is no such module, or it does not register that
+    """
+    if not module:
+        return
+    try:
+        importlib.import_module(module)
+    except (ImportError, ValueError) as error:
+        raise ValueError(f"env={module}:{env_id}: cannot import {module!r}, which should register {env_id!r} ({error})") from error
+    if env_id not in gym.registry:
+        raise ValueError(f"env={module}:{env_id}: {module} registers no {env_id!r}.{nearest(env_id, gym.registry)}")
+
+
+def task_id(name: str) -> str:
+    """
+    The one name of a task.
+
+    >>> task_id("PickCube-v1"), task_id("CPM/PickCube-v1"), task_id("CPMToy-v0")
+    ('CPM/PickCube-v1', 'CPM/PickCube-v1', 'CPMToy-v0')
+
+    :param name: a gymnasium id, or ManiSkill's own name of one of its tasks, which here has observations for player and
+        challenger, and the namespace ``CPM/``
+    :return: the gymnasium id; a task of ManiSkill is registered
+    :raises ValueError: if there is no such task, with the nearest name
+    """
+    task = name.removeprefix(NAMESPACE)
+    if f"{NAMESPACE}{task}" in gym.registry:
+        return f"{NAMESPACE}{task}"
+    register_suite(name)
+    spec = gym.registry.get(name)
+    if spec is not None and not getattr(getattr(spec.entry_point, "func", None), "__module__", "").startswith("mani_skill"):
+        return name
+    if importlib.util.find_spec("mani_skill") is not None and knows_task(task):
+        register_task(task)
+        return f"{NAMESPACE}{task}"
+    raise ValueError(f"Unknown environment {name!r}.{nearest(name, [*gym.registry, *TASKS])}")
+
+
 def ensure_registered(env_id: str) -> None:
     """
     Import what registers an environment, if it is one that a known package brings.
@@ -211,6 +267,30 @@ def ensure_registered(env_id: str) -> None:
     register_suite(env_id)
     if env_id not in gym.registry:
         raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
+
+
+def can_render(env_id: str) -> bool:
+    """:return: whether an environment gives pictures"""
+    spec = gym.spec(env_id)
+    entry_point = spec.entry_point
+    creator = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return creator is make_task or "rgb_array" in getattr(creator, "metadata", {}).get("render_modes", [])
+
+
+def _robust(seed: int, makers: Sequence[Callable[[], gym.Env]], **kwargs: Any) -> VecEnv:
+    """
+    :param seed: of the run
+    :param makers: of the environments
+    :param kwargs: of the class
+    :return: them in processes of their own
+    """
+    return RobustSubprocVecEnv([functools.partial(_in_a_worker, one, seed + rank) for rank, one in enumerate(makers)], **kwargs)
+
+
+def _in_a_worker(make: Callable[[], gym.Env], seed: int) -> gym.Env:
+    set_random_seed(seed)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main one ends this one
+    return make()
 
 
 # ---------------------------------------------------------------------- reading

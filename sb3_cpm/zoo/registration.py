@@ -45,15 +45,36 @@ def register_tasks() -> None:
     """Make the ids known to gymnasium. Can be repeated."""
     for state in (False, True):
         for task in TASKS:
-            if env_id_of(task, state) not in gym.registry:
-                gym.register(
-                    id=env_id_of(task, state),
-                    entry_point="sb3_cpm.zoo.registration:make_task",
-                    kwargs={"task": task, **({"obs_mode": "state"} if state else {})},
-                    # both wrap what is already checked and ordered, and would hide `batch` from wrappers
-                    disable_env_checker=True,
-                    order_enforce=False,
-                )
+            register_task(task, state)
+
+
+def register_task(task: str, state: bool = False) -> None:
+    """
+    Make one id known to gymnasium. Can be repeated.
+
+    :param task: ManiSkill's name of it
+    :param state: the variant whose observation is the full state vector
+    """
+    if env_id_of(task, state) not in gym.registry:
+        gym.register(
+            id=env_id_of(task, state),
+            entry_point="sb3_cpm.zoo.registration:make_task",
+            kwargs={"task": task, **({"obs_mode": "state"} if state else {})},
+            # both wrap what is already checked and ordered, and would hide `batch` from wrappers
+            disable_env_checker=True,
+            order_enforce=False,
+        )
+
+
+def knows_task(task: str) -> bool:
+    """:return: whether ManiSkill has a task of that name; it is imported for that"""
+    import mani_skill.envs  # noqa: F401  # registers them
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    from sb3_cpm.envs import tasks
+
+    tasks.register_tasks()
+    return task in REGISTERED_ENVS
 
 
 def make_task(task: str, render_mode: str | None = None, **kwargs: Any) -> gym.Env:
