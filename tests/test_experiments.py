@@ -18,6 +18,7 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_cpm.__main__ import main
+from sb3_cpm.agents import load_agent
 from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_data, find_experiment, run_experiment, summary_table
 from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
@@ -32,7 +33,6 @@ from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSp
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.files import LockedError, locked
 from sb3_cpm.run.evaluation import FIRST_SEED
-from sb3_cpm.zoo.agents import load_agent
 
 TINY = {
     "policy": "MultiInputPolicy",

@@ -26,7 +26,7 @@ from sb3_cpm.run.folder import versions, write_yaml
 from sb3_cpm.run.settings import FIRST_SEED
 
 if TYPE_CHECKING:
-    from sb3_cpm.zoo.agents import Agent
+    from sb3_cpm.agents import Agent
 
 CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
 

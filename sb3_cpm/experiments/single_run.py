@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import __version__
+from sb3_cpm.agents import Built, load_agent
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.experiments import checkpoint as checkpoints
 from sb3_cpm.experiments import run_folder
@@ -24,7 +25,6 @@ from sb3_cpm.experiments.tables import COLUMNS, Table
 from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.files import DamagedFileError, NotFiniteError, NotWrittenError, locked
 from sb3_cpm.run.settings import check_seed
-from sb3_cpm.zoo.agents import Built, load_agent
 
 #: How often diagnostics are written in a run.
 N_DUMPS = 50

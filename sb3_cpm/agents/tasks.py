@@ -9,6 +9,8 @@ from typing import Any
 import gymnasium as gym
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm.arguments import nearest
+from sb3_cpm.envs.suites import register_suite
 
 TASKS = (
     "PickCube-v1",
@@ -48,7 +50,7 @@ def register_tasks() -> None:
             if env_id_of(task, state) not in gym.registry:
                 gym.register(
                     id=env_id_of(task, state),
-                    entry_point="sb3_cpm.zoo.registration:make_task",
+                    entry_point="sb3_cpm.agents.tasks:make_task",
                     kwargs={"task": task, **({"obs_mode": "state"} if state else {})},
                     # both wrap what is already checked and ordered, and would hide `batch` from wrappers
                     disable_env_checker=True,
@@ -67,3 +69,15 @@ def make_task(task: str, render_mode: str | None = None, **kwargs: Any) -> gym.E
     from sb3_cpm.envs import make_maniskill_env
 
     return make_maniskill_env(task, render_mode="rgb_array" if render_mode == "human" else render_mode, **kwargs)
+
+
+def ensure_registered(env_id: str) -> None:
+    """
+    Register our tasks, and import what registers an environment, if it is one that a known package brings.
+
+    :raises ValueError: if gymnasium does not know it, with the nearest name
+    """
+    register_tasks()
+    register_suite(env_id)
+    if env_id not in gym.registry:
+        raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cpm.arguments import nearest
-from sb3_cpm.envs.suites import register_suite
-from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
+from sb3_cpm.agents.algorithms import add_names, algorithm_of, algorithms
+from sb3_cpm.agents.checks import check_hyperparameters
+from sb3_cpm.agents.configs import find_config, find_entry, merge, read_entries
+from sb3_cpm.agents.tasks import ensure_registered
 
 
 class Built(NamedTuple):
@@ -109,6 +109,7 @@ class Agent:
 
     def _manager(self, seed: int, device: str, vec_env_type: str) -> tuple[Any, dict[str, Any]]:
         """rl_zoo3's manager, and the arguments of the algorithm as it has read them."""
+        add_names()
         from rl_zoo3 import exp_manager
 
         manager = _quietly(
@@ -150,87 +151,6 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     algo = algorithm_of(path.stem)
     check_hyperparameters(merged, algo, env_id, path)
     return Agent(path.stem, algo, env_id, merged, path)
-
-
-# ---------------------------------------------------------------------- names
-
-
-def config_folder() -> Path:
-    """
-    :return: ``zoo_configs/`` of the checkout that this package is in, or else of the working directory
-    :raises ValueError: where there is none
-    """
-    candidates = [Path(__file__).resolve().parents[2] / "zoo_configs", Path.cwd() / "zoo_configs"]
-    for folder in candidates:
-        if folder.is_dir():
-            return folder
-    raise ValueError(f"No folder zoo_configs, neither in {candidates[0].parent} nor here: give the path of a file.")
-
-
-def find_config(name_or_path: str | Path) -> Path:
-    """
-    :param name_or_path: a name in ``zoo_configs/``, or a path
-    :return: the file
-    :raises ValueError: if there is none, with the nearest name
-    """
-    given = Path(name_or_path)
-    if given.suffix in (".yml", ".yaml"):
-        if given.is_file():
-            return given
-        raise ValueError(f"There is no file {given}.")
-    folder = config_folder()
-    names = sorted(path.stem for path in folder.glob("*.yml"))
-    if str(name_or_path) not in names:
-        raise ValueError(f"Unknown agent {str(name_or_path)!r}.{nearest(str(name_or_path), names)} Known: {', '.join(names)}.")
-    return folder / f"{name_or_path}.yml"
-
-
-def algorithm_of(name: str) -> str:
-    """
-    The algorithm that a file is for: the one that is a part of its name.
-
-    >>> algorithm_of("cpm_sac_report")
-    'sac'
-
-    :raises ValueError: if no part is one
-    """
-    known = algorithms()
-    padded = f"_{name}_"
-    matches = [algo for algo in known if f"_{algo}_" in padded]
-    if not matches:
-        raise ValueError(f"The name {name!r} contains no algorithm (one of {', '.join(known)}): rename the file, my_sac.yml.")
-    return max(matches, key=len)  # ppo_lstm, not ppo
-
-
-def ensure_registered(env_id: str) -> None:
-    """
-    Import what registers an environment, if it is one that a known package brings.
-
-    :raises ValueError: if gymnasium does not know it, with the nearest name
-    """
-    register_suite(env_id)
-    if env_id not in gym.registry:
-        raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
-
-
-# ---------------------------------------------------------------------- reading
-
-
-def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param base: is not changed
-    :param overrides: dicts are merged entry by entry, everything else replaces; None removes
-    :return: both
-    """
-    result = copy.deepcopy(dict(base))
-    for key, value in overrides.items():
-        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
-            result[key] = merge(result[key], value)
-        elif value is None:
-            result.pop(key, None)
-        else:
-            result[key] = copy.deepcopy(value)
-    return result
 
 
 def _quietly(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
