@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from sb3_cpm.agents import load_agent
 from sb3_cpm.experiments.specification import RunResult
 from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.files import DamagedRunError, locked
@@ -11,7 +12,6 @@ from sb3_cpm.run.execution import Run, RunOptions
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.stored_run import read_run
 from sb3_cpm.seeds import check_seed
-from sb3_cpm.zoo.agents import load_agent
 
 
 def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda news: None, device: str = "cpu") -> RunResult:

@@ -188,7 +188,7 @@ class Experiment:
         :raises ValueError: for a version that this experiment does not have, fewer seeds or steps than one, or a name, with
             the nearest
         """
-        from sb3_cpm.zoo.agents import algorithm_of
+        from sb3_cpm.agents.algorithms import algorithm_of
 
         if seeds is not None and seeds < 1:
             raise ValueError(f"seeds={seeds}: expected 1 or more")
@@ -230,7 +230,7 @@ def _chosen(kind: str, names: Sequence[str] | None, all_of_them: Sequence[_Named
 
 
 def _merged(*overrides: dict[str, Any]) -> dict[str, Any]:
-    from sb3_cpm.zoo.agents import merge
+    from sb3_cpm.agents.configs import merge
 
     result: dict[str, Any] = {}
     for one in overrides:

@@ -24,13 +24,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import __version__
 from sb3_cpm import checkpoint as checkpoints
+from sb3_cpm.agents import Agent, Built
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.files import DamagedRunError, NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import NOT_TRAINING, Summary, complete_times, evaluated, peak_memory_gb
 from sb3_cpm.run.watcher import Watcher
-from sb3_cpm.zoo.agents import Agent, Built
 
 #: Exit status of a process that SIGTERM has ended, as shells count it.
 TERMINATED = 128 + signal.SIGTERM

@@ -32,7 +32,7 @@ from sb3_cpm.run.specification import RunSpec, fingerprint
 from sb3_cpm.seeds import FIRST_SEED
 
 if TYPE_CHECKING:  # whoever only reads results can do without
-    from sb3_cpm.zoo.agents import Agent
+    from sb3_cpm.agents import Agent
 
 CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
 PACKAGES = (

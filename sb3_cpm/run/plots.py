@@ -68,7 +68,9 @@ def learning_curve(folder: Path, title: str) -> None:
 
 
 def _per_evaluation(episodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """:return: mean, worst and best return and share of successes at the end, for every step at which there was an evaluation"""
+    """
+    :return: mean, worst and best return and share of successes at the end, for every step with an evaluation
+    """
     if not len(episodes.get("step", ())):
         return {}
     steps = np.unique(episodes["step"])

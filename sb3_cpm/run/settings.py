@@ -106,15 +106,16 @@ class TrainSettings:
             raise ValueError(f"seed={self.seed}: expected 0 or more")
         if self.evaluations < 0 or self.evaluations == 1 or (self.evaluations and self.eval_episodes < 1):
             raise ValueError(
-                f"evaluations={self.evaluations} with eval_episodes={self.eval_episodes}: expected two evaluations or more, at "
-                "the start and at the end, of at least one episode each, or evaluations=0 for none"
+                f"evaluations={self.evaluations} with eval_episodes={self.eval_episodes}: expected two evaluations or more, "
+                "at the start and at the end, of at least one episode each, or evaluations=0 for none"
             )
         if self.resume is not None:
-            given = [one.name for one in fields(self) if one.name not in WITH_RESUME and getattr(self, one.name) != _default(one)]
-            if given:
+            changed = [one.name for one in fields(self) if getattr(self, one.name) != _default(one)]
+            others = [name for name in changed if name not in WITH_RESUME]
+            if others:
                 raise ValueError(
-                    f"resume={self.resume!r} goes on with that run as it is; given were {', '.join(given)}, too. Expected beside "
-                    f"it only {', '.join(WITH_RESUME[1:])}: leave the others out, or begin a new run with them"
+                    f"resume={self.resume!r} goes on with that run as it is, but {', '.join(others)} came with it. Expected "
+                    f"beside it only {', '.join(WITH_RESUME[1:])}: leave the others out, or begin a new run with them"
                 )
 
     def overrides(self) -> dict[str, Any]:
@@ -126,14 +127,12 @@ class TrainSettings:
         entries.update(self.model_kwargs)
         buffer = {} if self.challenge_ratio is None else {"challenge_ratio": self.challenge_ratio}
         callback = {theirs: getattr(self, ours) for ours, theirs in _CALLBACK.items() if getattr(self, ours) is not None}
-        for name, arguments in (
-            ("env_kwargs", self.env_kwargs),
-            ("replay_buffer_kwargs", {**buffer, **self.buffer_kwargs}),
-            ("callback", _of_challenger({**callback, **self.callback_kwargs})),
-        ):
-            if arguments:
-                entries[name] = arguments
-        return entries
+        nested = {
+            "env_kwargs": self.env_kwargs,
+            "replay_buffer_kwargs": {**buffer, **self.buffer_kwargs},
+            "callback": _of_challenger({**callback, **self.callback_kwargs}),
+        }
+        return {**entries, **{name: arguments for name, arguments in nested.items() if arguments}}
 
     def as_dict(self) -> dict[str, Any]:
         """:return: the settings by name"""

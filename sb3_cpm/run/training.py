@@ -8,6 +8,8 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_cpm.agents import Agent, load_agent
+from sb3_cpm.agents.tasks import imported, task_id
 from sb3_cpm.extras import check_installed
 from sb3_cpm.files import locked
 from sb3_cpm.run import folder as run_folder
@@ -17,7 +19,6 @@ from sb3_cpm.run.settings import TrainSettings
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import Summary
 from sb3_cpm.seeds import check_seed
-from sb3_cpm.zoo.agents import Agent, imported, load_agent, task_id
 
 #: What a run is called that belongs to no experiment.
 EXPERIMENT = "train"
@@ -115,8 +116,8 @@ def _go_on(folder: Path, settings: TrainSettings, callback: BaseCallback | None)
         stored = run_folder.read_yaml(folder / run_folder.CONFIG)
         if "run" not in stored:
             raise ValueError(
-                f"resume={str(folder)!r}: its {run_folder.CONFIG} is of an earlier sb3_cpm, whose `train` wrote no checkpoints. "
-                "Begin the run anew."
+                f"resume={str(folder)!r}: its {run_folder.CONFIG} is of an earlier sb3_cpm, whose `train` wrote no "
+                "checkpoints. Begin the run anew."
             )
         if run_folder.is_finished(folder):
             raise ValueError(

@@ -11,6 +11,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import checkpoint as checkpoints
+from sb3_cpm.agents import Built
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import DamagedFileError, DamagedRunError, NotFiniteError, NotWrittenError
 from sb3_cpm.run.diagnostics import DiagnosticsWriter
@@ -20,7 +21,6 @@ from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.tables import COLUMNS, Table
 from sb3_cpm.stopwatch import Stopwatch
-from sb3_cpm.zoo.agents import Built
 
 #: How often diagnostics are written in a run.
 N_DUMPS = 50

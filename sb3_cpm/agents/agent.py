@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import copy
 import functools
-import importlib.util
 import io
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -25,11 +24,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_cpm.arguments import nearest
+from sb3_cpm.agents.algorithms import add_names, algorithm_of, algorithms
+from sb3_cpm.agents.checks import check_hyperparameters
+from sb3_cpm.agents.configs import find_config, find_entry, merge, read_entries
+from sb3_cpm.agents.tasks import can_render, ensure_registered
 from sb3_cpm.envs.robust import RobustSubprocVecEnv
-from sb3_cpm.envs.suites import register_suite
-from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
-from sb3_cpm.zoo.registration import NAMESPACE, TASKS, knows_task, make_task, register_task
 
 
 class Built(NamedTuple):
@@ -122,6 +121,7 @@ class Agent:
 
     def _manager(self, seed: int, device: str, vec_env_type: str) -> tuple[Any, dict[str, Any]]:
         """rl_zoo3's manager, and the arguments of the algorithm as it has read them."""
+        add_names()
         from rl_zoo3 import exp_manager
 
         manager = _quietly(
@@ -165,118 +165,6 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     return Agent(path.stem, algo, env_id, merged, path)
 
 
-# ---------------------------------------------------------------------- names
-
-
-def config_folder() -> Path:
-    """
-    :return: ``zoo_configs/`` of the checkout that this package is in, or else of the working directory
-    :raises ValueError: where there is none
-    """
-    candidates = [Path(__file__).resolve().parents[2] / "zoo_configs", Path.cwd() / "zoo_configs"]
-    for folder in candidates:
-        if folder.is_dir():
-            return folder
-    raise ValueError(f"No folder zoo_configs, neither in {candidates[0].parent} nor here: give the path of a file.")
-
-
-def find_config(name_or_path: str | Path) -> Path:
-    """
-    :param name_or_path: a name in ``zoo_configs/``, or a path
-    :return: the file
-    :raises ValueError: if there is none, with the nearest name
-    """
-    given = Path(name_or_path)
-    if given.suffix in (".yml", ".yaml"):
-        if given.is_file():
-            return given
-        raise ValueError(f"There is no file {given}.")
-    folder = config_folder()
-    names = sorted(path.stem for path in folder.glob("*.yml"))
-    if str(name_or_path) not in names:
-        raise ValueError(f"Unknown agent {str(name_or_path)!r}.{nearest(str(name_or_path), names)} Known: {', '.join(names)}.")
-    return folder / f"{name_or_path}.yml"
-
-
-def algorithm_of(name: str) -> str:
-    """
-    The algorithm that a file is for: the one that is a part of its name.
-
-    >>> algorithm_of("cpm_sac_report")
-    'sac'
-
-    :raises ValueError: if no part is one
-    """
-    known = algorithms()
-    padded = f"_{name}_"
-    matches = [algo for algo in known if f"_{algo}_" in padded]
-    if not matches:
-        raise ValueError(f"The name {name!r} contains no algorithm (one of {', '.join(known)}): rename the file, my_sac.yml.")
-    return max(matches, key=len)  # ppo_lstm, not ppo
-
-
-def imported(module: str, env_id: str) -> None:
-    """
-    gymnasium's ``MODULE:ID``: import what registers a task.
-
-    :param module: its name; "" for nothing
-    :param env_id: the task
-    :raises ValueError: if there is no such module, or it does not register that
-    """
-    if not module:
-        return
-    try:
-        importlib.import_module(module)
-    except (ImportError, ValueError) as error:
-        raise ValueError(f"env={module}:{env_id}: cannot import {module!r}, which should register {env_id!r} ({error})") from error
-    if env_id not in gym.registry:
-        raise ValueError(f"env={module}:{env_id}: {module} registers no {env_id!r}.{nearest(env_id, gym.registry)}")
-
-
-def task_id(name: str) -> str:
-    """
-    The one name of a task.
-
-    >>> task_id("PickCube-v1"), task_id("CPM/PickCube-v1"), task_id("CPMToy-v0")
-    ('CPM/PickCube-v1', 'CPM/PickCube-v1', 'CPMToy-v0')
-
-    :param name: a gymnasium id, or ManiSkill's own name of one of its tasks, which here has observations for player and
-        challenger, and the namespace ``CPM/``
-    :return: the gymnasium id; a task of ManiSkill is registered
-    :raises ValueError: if there is no such task, with the nearest name
-    """
-    task = name.removeprefix(NAMESPACE)
-    if f"{NAMESPACE}{task}" in gym.registry:
-        return f"{NAMESPACE}{task}"
-    register_suite(name)
-    spec = gym.registry.get(name)
-    if spec is not None and not getattr(getattr(spec.entry_point, "func", None), "__module__", "").startswith("mani_skill"):
-        return name
-    if importlib.util.find_spec("mani_skill") is not None and knows_task(task):
-        register_task(task)
-        return f"{NAMESPACE}{task}"
-    raise ValueError(f"Unknown environment {name!r}.{nearest(name, [*gym.registry, *TASKS])}")
-
-
-def ensure_registered(env_id: str) -> None:
-    """
-    Import what registers an environment, if it is one that a known package brings.
-
-    :raises ValueError: if gymnasium does not know it, with the nearest name
-    """
-    register_suite(env_id)
-    if env_id not in gym.registry:
-        raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
-
-
-def can_render(env_id: str) -> bool:
-    """:return: whether an environment gives pictures"""
-    spec = gym.spec(env_id)
-    entry_point = spec.entry_point
-    creator = gym.envs.registration.load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    return creator is make_task or "rgb_array" in getattr(creator, "metadata", {}).get("render_modes", [])
-
-
 def _robust(seed: int, makers: Sequence[Callable[[], gym.Env]], **kwargs: Any) -> VecEnv:
     """
     :param seed: of the run
@@ -284,33 +172,14 @@ def _robust(seed: int, makers: Sequence[Callable[[], gym.Env]], **kwargs: Any) -
     :param kwargs: of the class
     :return: them in processes of their own
     """
-    return RobustSubprocVecEnv([functools.partial(_in_a_worker, one, seed + rank) for rank, one in enumerate(makers)], **kwargs)
+    seeded = [functools.partial(_in_a_worker, make, seed + rank) for rank, make in enumerate(makers)]
+    return RobustSubprocVecEnv(seeded, **kwargs)
 
 
 def _in_a_worker(make: Callable[[], gym.Env], seed: int) -> gym.Env:
     set_random_seed(seed)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main one ends this one
     return make()
-
-
-# ---------------------------------------------------------------------- reading
-
-
-def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param base: is not changed
-    :param overrides: dicts are merged entry by entry, everything else replaces; None removes
-    :return: both
-    """
-    result = copy.deepcopy(dict(base))
-    for key, value in overrides.items():
-        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
-            result[key] = merge(result[key], value)
-        elif value is None:
-            result.pop(key, None)
-        else:
-            result[key] = copy.deepcopy(value)
-    return result
 
 
 def _quietly(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
