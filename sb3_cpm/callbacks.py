@@ -26,13 +26,13 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrappe
 
 from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
-from sb3_cpm.challenger import Challenger, choose_uncertainty
+from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
 from sb3_cpm.presets import DEFAULT, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
-from sb3_cpm.uncertainty.base import Uncertainty
+from sb3_cpm.uncertainty import Uncertainty, choose_uncertainty
 from sb3_cpm.world_model.observations import how_to_be_read, is_vector, unread
 
 _PARENTHESES = (

@@ -102,8 +102,8 @@ def test_the_mixture_goes_from_one_to_the_other() -> None:
 
 
 def imagine(challenger: Challenger) -> LatentState:
-    batch = challenger._to_device(random_batch(challenger.observation_space, challenger.action_dim))
-    return challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+    batch = challenger.learner.to_device(random_batch(challenger.observation_space, challenger.action_dim))
+    return challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -114,7 +114,7 @@ def test_the_actor_learns_with_the_critic_zeroed_and_nobody_else_does(kind: str)
         for parameter in exploration.target_critic.parameters():
             parameter.zero_()
     before = weights(challenger)
-    metrics = update(challenger, start, challenger._imagined_novelty)
+    metrics = update(challenger, start, challenger.learner.imagined_novelty)
     assert metrics["exploration_actor_grad_norm"] > 0 and metrics["exploration_critic_grad_norm"] > 0
     changed = {key for key, value in weights(challenger).items() if not np.array_equal(value, before[key])}
     expected = {key for key in before if key.startswith(("exploration.actor", "exploration.critic"))}
@@ -155,7 +155,7 @@ def test_starts_that_count_for_nothing_have_no_influence(kind: str) -> None:
     found = []
     for states in (start, other):
         torch.manual_seed(0)
-        arguments = (challenger.world_model, states, challenger._imagined_novelty, challenger.optimizers)
+        arguments = (challenger.world_model, states, challenger.learner.imagined_novelty, challenger.optimizers)
         found.append((exploration.losses(*arguments, share), exploration.losses(*arguments)))
     (one, alike), (another, different) = found
     for left, right in zip((one.actor, *one.actor_gradients), (another.actor, *another.actor_gradients), strict=True):
@@ -237,12 +237,12 @@ def test_mixed_precision_is_off_by_default_and_changes_little(preset: dict[str, 
 
 def test_mixed_precision_computes_in_bfloat16_and_keeps_float32_where_it_counts() -> None:
     challenger = small(BOTH, amp=True)
-    batch, seen = challenger._to_device(random_batch(BOTH, 2)), set()
+    batch, seen = challenger.learner.to_device(random_batch(BOTH, 2)), set()
     linear = challenger.world_model.decoder.cnn.linear  # type: ignore[union-attr]
     linear.register_forward_hook(lambda module, inputs, output: seen.add(output.dtype))
     with acceleration.mixed_precision(challenger.device, True):
         output = challenger.world_model.loss(batch)
-        start = challenger._imagination_starts(batch, output)
+        start = challenger.learner.imagination_starts(batch, output)
         imagined = challenger.exploration.imagine(challenger.world_model, start)
     assert seen == {torch.bfloat16}
     kept = (*output.losses.values(), *output.metrics.values(), *output.posterior, output.embed, *imagined)

@@ -24,10 +24,10 @@ def behaviour_losses(challenger: Challenger, by_hand: bool, monkeypatch: pytest.
         if not by_hand:
             patch.setattr(ActorCritic, "_learns_by_hand", lambda *arguments: False)
         torch.manual_seed(0)
-        batch = challenger._to_device(random_batch(VECTOR, challenger.action_dim))
-        start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+        batch = challenger.learner.to_device(random_batch(VECTOR, challenger.action_dim))
+        start = challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
         share = torch.linspace(0.0, 2.0, len(start.deter))
-        return [challenger._learn_behavior(name, *start, share) for name in challenger.behaviors]
+        return [challenger.learner.learn_behavior(name, *start, share) for name in challenger.behaviors]
 
 
 def assert_alike(found: list[BehaviorLosses], expected: list[BehaviorLosses]) -> None:

@@ -177,7 +177,7 @@ def test_the_scan_by_hand_is_the_plain_one(latent: Any, monkeypatch: pytest.Monk
 
 def test_the_scan_by_hand_trains_and_everything_else_does_not_use_it() -> None:
     challenger = small(BOTH)
-    output = challenger.world_model.loss(challenger._to_device(random_batch(BOTH, 2)))
+    output = challenger.world_model.loss(challenger.learner.to_device(random_batch(BOTH, 2)))
     names, nodes = set(), [output.losses["kl"].grad_fn]
     while nodes:
         node = nodes.pop()
@@ -188,7 +188,7 @@ def test_the_scan_by_hand_trains_and_everything_else_does_not_use_it() -> None:
     rssm, embed = challenger.world_model.rssm, torch.zeros(1, requires_grad=True)
     assert rssm._trains_by_hand(embed) and not rssm._trains_by_hand(embed.detach())
     with torch.autocast("cpu", dtype=torch.bfloat16):  # it keeps float32 then
-        output = challenger.world_model.loss(challenger._to_device(random_batch(BOTH, 2)))
+        output = challenger.world_model.loss(challenger.learner.to_device(random_batch(BOTH, 2)))
     assert {part.dtype for part in output.posterior} == {torch.float32}
     rssm._compiled_call_impl = rssm._call_impl  # what torch.compile leaves behind
     assert not rssm._trains_by_hand(embed)

@@ -32,6 +32,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import check_environment
 from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
 from sb3_cpm.challenger import Challenger, choose_device, rate_entry
+from sb3_cpm.challenger.file import state_to_check
 from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
 from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
@@ -40,7 +41,6 @@ from sb3_cpm.files import check_finite, verify, write_sealed
 from sb3_cpm.presets import make_preset
 from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.type_aliases import SequenceBatch
-from sb3_cpm.world_model.checkpoint import state_to_check
 from sb3_cpm.world_model.correlated_noise import CorrelatedNoise
 from sb3_cpm.world_model.observations import check_action_space, how_to_be_read, unread
 
@@ -345,8 +345,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         self.logger.record("train/learning_rate", 0.0 if frozen else rate)
         for name, optimizer in self.challenger.optimizers.items():
             own = preset[rate_entry(name)]
-            for group in optimizer.adam.param_groups:
-                group["lr"] = own if frozen else rate * own / preset["model_lr"]
+            optimizer.learning_rate = own if frozen else rate * own / preset["model_lr"]
 
     def _normalized(self, batch: SequenceBatch) -> SequenceBatch:
         """The buffer holds what the environment gave; behind a VecNormalize, what acts sees normalized observations."""

@@ -9,9 +9,9 @@ import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.challenger.file import is_model
 from sb3_cpm.files import verify
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
-from sb3_cpm.world_model.checkpoint import is_model
 
 
 class HasChallenger(Protocol):

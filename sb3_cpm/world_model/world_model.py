@@ -96,7 +96,7 @@ class WorldModel(nn.Module):
 
     def __init__(self, spec: ObservationSpec, action_dim: int, preset: Mapping[str, Any]) -> None:
         super().__init__()
-        self.spec, self.preset = spec, preset
+        self.spec, self.action_dim, self.preset = spec, action_dim, preset
         #: what the reconstruction error of each key is called in the log
         self.error_names = {key: f"error_{name}" for key, name in short_names(spec.keys).items()}
         vector = (preset["vector_layers"], preset["vector_units"])

@@ -38,12 +38,12 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
 from sb3_cpm.buffers.cpm_buffer import ONE_STEP
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.challenger import check_uncertainties, choose_uncertainty
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
 from sb3_cpm.extras import needed
 from sb3_cpm.presets import make_preset
+from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
 from sb3_cpm.zoo.registration import ENV_IDS, NAMESPACE
 
 with needed("Configurations", "zoo"):
