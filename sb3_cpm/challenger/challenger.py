@@ -97,7 +97,7 @@ class Challenger:
             self._uncertainty = kind(sizes, **self.uncertainty_kwargs).to(self.device)
             self._exploration = ActorCritic("exploration", *feat).to(self.device)
         self.task = ActorCritic("task", *feat).to(self.device) if self.preset["train_task_behavior"] else None
-        self.learner = Learner(self.world_model, self._uncertainty, self.behaviors, self.preset, self.device)
+        self.learner = Learner(self.world_model, self._uncertainty, self.behaviors, self.preset)
 
     @property
     def explores(self) -> bool:

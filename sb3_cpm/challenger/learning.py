@@ -30,7 +30,6 @@ class Learner:
     :param uncertainty: learns from the latents' transitions; None where nothing is explored
     :param behaviors: actor-critics by name, "exploration" and "task"; they learn in imagination
     :param preset: a complete one
-    :param device: where all networks are
     :raises ValueError: if the preset asks for mixed precision on a GPU that has none
     """
 
@@ -40,22 +39,26 @@ class Learner:
         uncertainty: Uncertainty | None,
         behaviors: Mapping[str, ActorCritic],
         preset: Mapping[str, Any],
-        device: torch.device,
     ) -> None:
         self.world_model, self.uncertainty, self.behaviors = world_model, uncertainty, behaviors
-        self.preset, self.device = preset, device
+        self.preset = preset
         self.updates = 0
         self.optimizers = self._make_optimizers()
         if preset["amp"]:
-            check_mixed_precision(device)
+            check_mixed_precision(self.device)
         #: CUDA graphs of whole updates; None unless ``compile`` is asked for on a GPU
         self.graphs: GraphedFunctions | None = None
         #: whether ``compile`` was asked for and works here
         self.compiled: bool = preset["compile"]
-        if self.compiled and device.type == "cuda":
-            self.graphs = GraphedFunctions(device)
+        if self.compiled and self.device.type == "cuda":
+            self.graphs = GraphedFunctions(self.device)
         elif self.compiled:
-            self.compiled = compile_modules(self._hot_modules(), device)
+            self.compiled = compile_modules(self._hot_modules(), self.device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where all networks are."""
+        return next(self.world_model.parameters()).device
 
     def _make_optimizers(self) -> dict[str, Optimizer]:
         common = {"eps": self.preset["adam_eps"], "clip": self.preset["grad_clip"]}
