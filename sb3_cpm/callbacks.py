@@ -29,7 +29,7 @@ from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
-from sb3_cpm.presets import DEFAULT, make_preset
+from sb3_cpm.presets import ENTRIES, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
 from sb3_cpm.uncertainty import Uncertainty, choose_uncertainty
@@ -285,7 +285,7 @@ class ChallengerCallback(BaseCallback):
             return
         self._told_unread = True
         assert self.challenger is not None
-        images_only = not self.challenger.preset["read_vectors"]  # then vectors are left out on purpose
+        images_only = not self.challenger.preset.read_vectors  # then vectors are left out on purpose
         for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
             if images_only and is_vector(space):
                 continue
@@ -505,7 +505,7 @@ def _check_challenger_kwargs(given: Any) -> None:
     for name in ("preset", "keys", "uncertainty_class", "uncertainty_kwargs", "device"):
         if isinstance(given, Mapping) and name in given:
             raise ValueError(f"challenger_kwargs are entries of the preset: give {name!r} to ChallengerCallback itself.")
-    check_names("challenger_kwargs", given, DEFAULT)
+    check_names("challenger_kwargs", given, ENTRIES)
 
 
 def without_exploration(env: VecEnv | None) -> VecEnv:

@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class Bandit(ActorCritic):
     def gradient(self, reward: Callable[[torch.Tensor], torch.Tensor], n: int = 200_000) -> torch.Tensor:
         """Of the actor's loss with respect to the two numbers, the baseline's share of the return left out."""
         stuck = LatentState(torch.zeros(n, 1), torch.zeros(n, 1), torch.zeros(n, 2))
-        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"):
+        with torch.set_grad_enabled(self.preset.actor_gradient != "reinforce"):
             imagined = self.imagine(Nothing(), stuck)  # type: ignore[arg-type]
             values = self.target_critic(imagined.next_feats).squeeze(-1)
             returns = reward(imagined.actions.squeeze(-1)) + 0.5 * values
@@ -172,7 +173,7 @@ def test_the_gradient_through_the_actors_input(horizon: int, same: bool) -> None
     challenger = small(horizon=horizon, exploration_entropy_scale=0.0)
     found = []
     for through in (True, False):
-        challenger.exploration.preset = {**challenger.exploration.preset, "actor_input_gradient": through}
+        challenger.exploration.preset = replace(challenger.exploration.preset, actor_input_gradient=through)
         torch.manual_seed(0)
         start = imagine(challenger)
         found.append(

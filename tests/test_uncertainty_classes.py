@@ -167,7 +167,7 @@ def test_each_moves_the_exploration_actor(name: str, kwargs: dict[str, Any]) -> 
 
 def test_presets_name_every_class() -> None:
     for preset in PRESETS.values():
-        assert set(preset["uncertainty"]) == set(UNCERTAINTY_CLASSES)
+        assert set(preset.uncertainty) == set(UNCERTAINTY_CLASSES)
     for name in UNCERTAINTY_CLASSES:
         assert np.isfinite(Challenger(VECTOR, box(2), "cpu", uncertainty_class=name).train(random_batch(VECTOR, 2))["kl"])
 

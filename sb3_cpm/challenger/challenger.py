@@ -7,6 +7,7 @@ come from torch's global generator, so that one seed rules the run.
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from sb3_cpm.challenger.file import (
 )
 from sb3_cpm.challenger.learning import Learner, rate_entry, real_transitions
 from sb3_cpm.files import check_finite
-from sb3_cpm.presets import make_preset
+from sb3_cpm.presets import PresetLike, make_preset
 from sb3_cpm.type_aliases import Evaluation, SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Uncertainty, choose_uncertainty
 from sb3_cpm.uncertainty.base import LatentSizes, checked_novelty
@@ -49,7 +50,8 @@ class Challenger:
     :param observation_space: Dict space; images (3-D, with finite bounds) and vectors (1-D) are read
     :param action_space: bounded Box; here all actions are scaled to [-1, 1] (SB3's ``policy.scale_action``)
     :param device: "auto" takes the GPU where there is one
-    :param preset: "default", "dreamer", "report", "report_images", or a dict of entries, see :mod:`sb3_cpm.presets`
+    :param preset: "default", "dreamer", "report", "report_images", a :class:`~sb3_cpm.presets.Preset` or a dict of
+        entries, see :mod:`sb3_cpm.presets`
     :param keys: the observation keys to read; all images, and vectors unless the preset leaves them out, by default
     :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
         :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
@@ -63,7 +65,7 @@ class Challenger:
         observation_space: spaces.Dict,
         action_space: spaces.Box,
         device: torch.device | str = "auto",
-        preset: str | Mapping[str, Any] = "default",
+        preset: PresetLike = "default",
         keys: Sequence[str] | None = None,
         uncertainty_class: str | type[Uncertainty] = "plan2explore",
         uncertainty_kwargs: Mapping[str, Any] | None = None,
@@ -75,11 +77,10 @@ class Challenger:
         self.observation_space, self.action_space = observation_space, action_space
         self.action_dim = int(np.prod(action_space.shape))
         self.spec = ObservationSpec(
-            observation_space, keys, squash=self.preset["symlog_vectors"], vectors=self.preset["read_vectors"]
+            observation_space, keys, squash=self.preset.symlog_vectors, vectors=self.preset.read_vectors
         )
         self.keys: tuple[str, ...] = self.spec.keys
-        self.batch_size: int = self.preset["batch_size"]
-        self.sequence_length: int = self.preset["sequence_length"]
+        self.batch_size, self.sequence_length = self.preset.batch_size, self.preset.sequence_length
 
         self.world_model = WorldModel(self.spec, self.action_dim, self.preset).to(self.device)
         self.uncertainty_name, kind, self.uncertainty_kwargs = choose_uncertainty(
@@ -93,10 +94,10 @@ class Challenger:
         feat = (model.feat_dim, self.action_dim, self.preset, model.latent.one_hot)
         self._uncertainty: Uncertainty | None = None
         self._exploration: ActorCritic | None = None
-        if self.preset["train_exploration_behavior"]:
+        if self.preset.train_exploration_behavior:
             self._uncertainty = kind(sizes, **self.uncertainty_kwargs).to(self.device)
             self._exploration = ActorCritic("exploration", *feat).to(self.device)
-        self.task = ActorCritic("task", *feat).to(self.device) if self.preset["train_task_behavior"] else None
+        self.task = ActorCritic("task", *feat).to(self.device) if self.preset.train_task_behavior else None
         self.learner = Learner(self.world_model, self._uncertainty, self.behaviors, self.preset)
 
     @property
@@ -391,8 +392,9 @@ class Challenger:
         saved = content["config"]["preset"]
         for name, optimizer in self.optimizers.items():
             entry = rate_entry(name)
-            if self.preset[entry] != saved[entry]:  # otherwise the file's, which a schedule may have changed
-                optimizer.learning_rate = self.preset[entry]
+            rate = getattr(self.preset, entry)
+            if rate != saved[entry]:  # otherwise the file's, which a schedule may have changed
+                optimizer.learning_rate = rate
 
     def _config(self) -> dict[str, Any]:
         """Plain data only: files are read without executing anything in them."""
@@ -400,7 +402,7 @@ class Challenger:
         return {
             "keys": describe_observations(self.spec),
             "action": action,
-            "preset": self.preset,
+            "preset": asdict(self.preset),
             "uncertainty_class": self.uncertainty_name,
             "uncertainty_kwargs": self.uncertainty_kwargs,
         }

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from sb3_cpm.presets import Preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty, checked_novelty
 from sb3_cpm.uncertainty.ensemble import Ensemble
@@ -29,7 +30,7 @@ class Learner:
     :param world_model: learns from all batches
     :param uncertainty: learns from the latents' transitions; None where nothing is explored
     :param behaviors: actor-critics by name, "exploration" and "task"; they learn in imagination
-    :param preset: a complete one
+    :param preset: their sizes and constants
     :raises ValueError: if the preset asks for mixed precision on a GPU that has none
     """
 
@@ -38,18 +39,18 @@ class Learner:
         world_model: WorldModel,
         uncertainty: Uncertainty | None,
         behaviors: Mapping[str, ActorCritic],
-        preset: Mapping[str, Any],
+        preset: Preset,
     ) -> None:
         self.world_model, self.uncertainty, self.behaviors = world_model, uncertainty, behaviors
         self.preset = preset
         self.updates = 0
         self.optimizers = self._make_optimizers()
-        if preset["amp"]:
+        if preset.amp:
             check_mixed_precision(self.device)
         #: CUDA graphs of whole updates; None unless ``compile`` is asked for on a GPU
         self.graphs: GraphedFunctions | None = None
         #: whether ``compile`` was asked for and works here
-        self.compiled: bool = preset["compile"]
+        self.compiled: bool = preset.compile
         if self.compiled and self.device.type == "cuda":
             self.graphs = GraphedFunctions(self.device)
         elif self.compiled:
@@ -61,11 +62,10 @@ class Learner:
         return next(self.world_model.parameters()).device
 
     def _make_optimizers(self) -> dict[str, Optimizer]:
-        common = {"eps": self.preset["adam_eps"], "clip": self.preset["grad_clip"]}
-        common["weight_decay"] = self.preset["weight_decay"]
-        optimizers = {"world_model": Optimizer("world model", [self.world_model], self.preset["model_lr"], **common)}
+        common = self.preset.optimizer_kwargs
+        optimizers = {"world_model": Optimizer("world model", [self.world_model], self.preset.model_lr, **common)}
         if self.uncertainty is not None:
-            optimizers["uncertainty"] = Optimizer("uncertainty", [self.uncertainty], self.preset["uncertainty_lr"], **common)
+            optimizers["uncertainty"] = Optimizer("uncertainty", [self.uncertainty], self.preset.uncertainty_lr, **common)
         for behavior in self.behaviors.values():
             optimizers.update(behavior.make_optimizers())
         return optimizers
@@ -122,7 +122,7 @@ class Learner:
         self, images: torch.Tensor | None, vectors: torch.Tensor | None, *rest: torch.Tensor
     ) -> tuple[WorldModelOutput, Gradients]:
         """The world model's losses for the parts of :class:`Sequences`, and their sum's gradients."""
-        with mixed_precision(self.device, self.preset["amp"]):
+        with mixed_precision(self.device, self.preset.amp):
             output = self.world_model.loss(Sequences(Inputs(images, vectors), *rest))
         losses = {name: value.detach() for name, value in output.losses.items()}
         return output._replace(losses=losses), self.optimizers["world_model"].gradients(output.total)
@@ -164,7 +164,7 @@ class Learner:
         """Posterior states to imagine from: rows that exist and do not end an episode, all or a random choice of them."""
         valid = batch.mask & ~batch.is_terminal
         index = (valid if bool(valid.any()) else batch.mask).flatten().nonzero().squeeze(1)
-        limit = self.preset["imagination_starts"]
+        limit = self.preset.imagination_starts
         if limit is not None and len(index) > limit:
             index = index[torch.randperm(len(index), device=self.device)[:limit]]
         return output.posterior.flatten().select(index)
@@ -179,7 +179,7 @@ class Learner:
         """
         if self.graphs is None:
             return start, None
-        limit = self.preset["imagination_starts"]
+        limit = self.preset.imagination_starts
         n, place = len(start.deter), torch.arange(rows if limit is None else min(limit, rows), device=self.device)
         return start.select(place % n), (place < n) * (len(place) / n)
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sb3_cpm.arguments import check_arguments, check_names, nearest
-from sb3_cpm.presets import plain
+from sb3_cpm.presets import Preset, plain
 from sb3_cpm.uncertainty.base import Uncertainty
 from sb3_cpm.uncertainty.observation_ensemble import ObservationEnsemble
 from sb3_cpm.uncertainty.plan2explore import Plan2Explore
@@ -19,26 +19,26 @@ UNCERTAINTY_CLASSES: dict[str, type[Uncertainty]] = {
 }
 
 
-def check_uncertainties(preset: Mapping[str, Any]) -> None:
+def check_uncertainties(preset: Preset) -> None:
     """
-    :param preset: a complete one
+    :param preset: has arguments of them
     :raises ValueError: for classes and arguments in its entry 'uncertainty' that there are not, with the nearest
     """
     where = "Preset entry 'uncertainty'"
     # a class of one's own has its module in its name, and may take its arguments in any way
-    known = {name: arguments for name, arguments in preset["uncertainty"].items() if "." not in name}
+    known = {name: arguments for name, arguments in preset.uncertainty.items() if "." not in name}
     check_names(where, known, UNCERTAINTY_CLASSES)
     for name, arguments in known.items():
         check_arguments(f"{where}, {name}", arguments, UNCERTAINTY_CLASSES[name], excluded=("sizes",))
 
 
 def choose_uncertainty(
-    kind: str | type[Uncertainty], kwargs: Mapping[str, Any] | None, preset: Mapping[str, Any]
+    kind: str | type[Uncertainty], kwargs: Mapping[str, Any] | None, preset: Preset
 ) -> tuple[str, type[Uncertainty], dict[str, Any]]:
     """
     :param kind: ``uncertainty_class`` of :class:`~sb3_cpm.challenger.Challenger`
     :param kwargs: ``uncertainty_kwargs``
-    :param preset: a complete one
+    :param preset: has arguments of them
     :return: its name in checkpoints, the class, and its arguments: the preset's with ``kwargs`` on top
     :raises ValueError: for names that there are not, with the nearest, also of arguments in the preset
     """
@@ -50,7 +50,7 @@ def choose_uncertainty(
                 f"{sorted(UNCERTAINTY_CLASSES)} or a class."
             )
         check_arguments("uncertainty_kwargs", kwargs, UNCERTAINTY_CLASSES[kind], excluded=("sizes",))
-        return kind, UNCERTAINTY_CLASSES[kind], plain({**preset["uncertainty"].get(kind, {}), **(kwargs or {})})
+        return kind, UNCERTAINTY_CLASSES[kind], plain({**preset.uncertainty.get(kind, {}), **(kwargs or {})})
     if not (isinstance(kind, type) and issubclass(kind, Uncertainty)):
         raise ValueError(f"`uncertainty_class` must be a name or a subclass of Uncertainty, got {kind!r}.")
     return f"{kind.__module__}.{kind.__qualname__}", kind, plain(dict(kwargs or {}))
