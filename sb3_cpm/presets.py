@@ -141,7 +141,7 @@ class Preset:
     train_exploration_behavior: bool
     """Novelty measure and exploration actor-critic, which a plain Dreamer does not need."""
 
-    # speed, see sb3_cpm.world_model.acceleration
+    # speed, see sb3_cpm.world_model.fast.acceleration
     amp: bool
     """Train in bfloat16 mixed precision; pays on GPUs with large images."""
     compile: bool
@@ -240,7 +240,7 @@ REPORT = Preset(
     slow_target_every=100,
     train_task_behavior=False,
     train_exploration_behavior=True,
-    # speed, see sb3_cpm.world_model.acceleration
+    # speed, see sb3_cpm.world_model.fast.acceleration
     amp=False,
     compile=False,
     uncertainty={

@@ -14,9 +14,9 @@ from torch import nn
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.presets import make_preset
-from sb3_cpm.world_model import acceleration
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
 from sb3_cpm.world_model.distributions import TruncatedNormal
+from sb3_cpm.world_model.fast import acceleration
 from sb3_cpm.world_model.rssm import LatentState
 
 KINDS = ("dynamics", "reinforce", "both")

@@ -11,7 +11,7 @@ from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, weights
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty import Plan2Explore, Transitions
-from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
+from sb3_cpm.world_model.fast.cuda_graphs import Graphed, GraphPool
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 CATEGORICAL = {"latent": "categorical", "stoch_size": 4, "stoch_classes": 5}

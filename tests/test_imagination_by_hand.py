@@ -9,9 +9,9 @@ from challenger_helpers import SMALL, VECTOR, random_batch, small
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses
-from sb3_cpm.world_model.by_hand import Returns, through
+from sb3_cpm.world_model.by_hand.dream import Dream
+from sb3_cpm.world_model.by_hand.returns import Returns, through
 from sb3_cpm.world_model.distributions import OutputSampler, TruncatedNormal
-from sb3_cpm.world_model.dream import Dream
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
 

@@ -12,16 +12,16 @@ from torch import nn
 from sb3_cpm.uncertainty import heads as heads_module
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
-from sb3_cpm.world_model import acceleration, activation, one_hot
-from sb3_cpm.world_model import linear as linear_module
-from sb3_cpm.world_model.acceleration import cache_slices
-from sb3_cpm.world_model.activation import ELU, elu_
-from sb3_cpm.world_model.deconvolution import Deconvolution
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
-from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
+from sb3_cpm.world_model.fast import acceleration, activation, one_hot
+from sb3_cpm.world_model.fast import linear as linear_module
+from sb3_cpm.world_model.fast.acceleration import cache_slices
+from sb3_cpm.world_model.fast.activation import ELU, elu_
+from sb3_cpm.world_model.fast.deconvolution import Deconvolution
+from sb3_cpm.world_model.fast.linear import Linear, affine, is_faster, linear
+from sb3_cpm.world_model.fast.one_hot import OneHot, OneHotLinear, find_choice
 from sb3_cpm.world_model.losses import squared_error
-from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder
-from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear, find_choice
+from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder, frozen
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 
 LATENTS = [GaussianLatent(4), CategoricalLatent(3, 5)]

@@ -12,11 +12,10 @@ from sb3_cpm.presets import Preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty, checked_novelty
 from sb3_cpm.uncertainty.ensemble import Ensemble
-from sb3_cpm.world_model.acceleration import check_mixed_precision, compile_modules, mixed_precision
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses, Imagination
-from sb3_cpm.world_model.cuda_graphs import GraphedFunctions
-from sb3_cpm.world_model.linear import frozen
-from sb3_cpm.world_model.networks import MLP
+from sb3_cpm.world_model.fast.acceleration import check_mixed_precision, compile_modules, mixed_precision
+from sb3_cpm.world_model.fast.cuda_graphs import GraphedFunctions
+from sb3_cpm.world_model.networks import MLP, frozen
 from sb3_cpm.world_model.observations import Inputs, to_tensor
 from sb3_cpm.world_model.optimizer import ADVICE, Gradients, Optimizer
 from sb3_cpm.world_model.rssm import LatentState

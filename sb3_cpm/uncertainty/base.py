@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from sb3_cpm.world_model.one_hot import OneHot
+from sb3_cpm.world_model.fast.one_hot import OneHot
 
 
 class Transitions(NamedTuple):

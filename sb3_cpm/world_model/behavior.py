@@ -21,14 +21,13 @@ import torch
 from torch import nn
 
 from sb3_cpm.presets import Preset
-from sb3_cpm.world_model.acceleration import is_compiled, is_plain, mixed_precision
-from sb3_cpm.world_model.by_hand import Returns, through
+from sb3_cpm.world_model.by_hand.dream import Dream, DreamSettings
+from sb3_cpm.world_model.by_hand.returns import Returns, through
 from sb3_cpm.world_model.distributions import GaussianLatent, TruncatedNormal
-from sb3_cpm.world_model.dream import Dream, Settings
-from sb3_cpm.world_model.linear import frozen
+from sb3_cpm.world_model.fast.acceleration import is_compiled, is_plain, mixed_precision
+from sb3_cpm.world_model.fast.one_hot import OneHot
 from sb3_cpm.world_model.losses import lambda_returns
-from sb3_cpm.world_model.networks import MLP
-from sb3_cpm.world_model.one_hot import OneHot
+from sb3_cpm.world_model.networks import MLP, frozen
 from sb3_cpm.world_model.optimizer import Gradients, Optimizer
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 from sb3_cpm.world_model.world_model import WorldModel
@@ -133,7 +132,7 @@ class ActorCritic(nn.Module):
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """
         if self._learns_by_hand(world_model, start):
-            settings = Settings(self.preset.horizon, self.preset.actor_input_gradient)
+            settings = DreamSettings(self.preset.horizon, self.preset.actor_input_gradient)
             layers = [layer for layer in self.actor.net if isinstance(layer, nn.Linear)]
             actor = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
             here, there, acts, outputs = Dream.apply(settings, world_model.rssm.dynamics(), start.deter, start.stoch, *actor)
@@ -156,8 +155,8 @@ class ActorCritic(nn.Module):
 
     def _learns_by_hand(self, world_model: WorldModel, start: LatentState) -> bool:
         """
-        Whether gradients are computed by hand (:mod:`~sb3_cpm.world_model.dream`, :mod:`~sb3_cpm.world_model.by_hand`): with
-        Gaussian latents, in plain float32 on a CPU. They are the same as autograd's.
+        Whether gradients are computed by hand (:mod:`~sb3_cpm.world_model.by_hand`): with Gaussian latents, in plain float32
+        on a CPU. They are the same as autograd's.
         """
         return (
             is_plain(start.deter)
@@ -189,7 +188,7 @@ class ActorCritic(nn.Module):
         with torch.set_grad_enabled(self.preset.actor_gradient != "reinforce"), frozen(*constant):
             with amp:
                 imagined = self.imagine(world_model, start)
-            rewards = reward(imagined)
+            rewards = reward(imagined)  # (H, n), and so are returns, values and discounts: [i] of arriving in state i + 1
             gamma, lambda_ = self.preset.gamma, self.preset.lambda_
             if by_hand:
                 heads = (self.target_critic, world_model.continue_head)
@@ -200,9 +199,9 @@ class ActorCritic(nn.Module):
                     values = self.target_critic(imagined.next_feats).float().squeeze(-1)
                 returns = lambda_returns(rewards, values, discounts, lambda_)
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
-        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
-        share = torch.ones_like(reached[0]) if share is None else share
-        weight = reached * share
+        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()  # (H, n)
+        share = torch.ones_like(reached[0]) if share is None else share  # (n,)
+        weight = reached * share  # (H, n)
 
         objective, entropies = self._objective(imagined, returns, values)
         actor_loss = -(weight * (objective + self.entropy_scale * entropies)).mean()
@@ -229,7 +228,7 @@ class ActorCritic(nn.Module):
         """
         feats = imagined.feats.detach()
         if by_hand:
-            judged = through(self.critic, feats)
+            judged = through(self.critic, feats)  # of H * n rows
             error = judged.output.view_as(returns) - returns
             loss = (weight * 0.5 * error.square()).mean()
             return loss, judged.to_parameters((weight * error / error.numel()).view(-1, 1))
@@ -270,7 +269,7 @@ class ActorCritic(nn.Module):
         with mixed_precision(feats.device, self.preset.amp):
             policy = self.actor(feats)
         with torch.no_grad():
-            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))
+            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))  # of states 0..H-1, (H, n)
             advantage = returns - baseline
         reinforce = policy.log_prob(imagined.actions.detach()) * advantage
         if kind == "reinforce":
