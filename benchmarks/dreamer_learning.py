@@ -20,6 +20,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def run_sheeprl(env: str, seed: int, path: Path, python: str) -> None:
     settings = dict(
         env=env, id=task["id"], seed=seed, steps=task["steps"], every=task["every"], episodes=EPISODES, path=str(path),
         learning_starts=LEARNING_STARTS, train_freq=task["train_freq"], pretrain=task["pretrain"],
-        last_rate=task["last_rate"], preset=make_preset(cnn_layers=3),  # its decoder starts from 4x4, ours from 2x2
+        last_rate=task["last_rate"], preset=asdict(make_preset(cnn_layers=3)),  # its decoder starts from 4x4, ours from 2x2
     )  # fmt: skip
     script = Path(__file__).parent / "peers" / "sheeprl_learning.py"
     subprocess.run([python, str(script), json.dumps(settings)], check=True)

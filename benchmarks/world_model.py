@@ -33,6 +33,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from functools import partial
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -44,7 +45,7 @@ from clock import Clock, Enough, Lap, clocked, median, timed
 from gymnasium import spaces
 
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.presets import make_preset
+from sb3_cpm.presets import Preset, make_preset
 from sb3_cpm.type_aliases import SequenceBatch
 
 ACTION_DIM, STATE_DIM = 7, 29
@@ -101,10 +102,10 @@ def make_space(size: int, cameras: int, state_dim: int = STATE_DIM) -> spaces.Di
     return spaces.Dict({**images, "state": spaces.Box(-np.inf, np.inf, (state_dim,), np.float32)})
 
 
-def make_batch(space: spaces.Dict, preset: dict[str, Any], action_dim: int = ACTION_DIM) -> SequenceBatch:
+def make_batch(space: spaces.Dict, preset: Preset, action_dim: int = ACTION_DIM) -> SequenceBatch:
     """Whole sequences of noise; what is in them does not change what they cost."""
     rng = np.random.default_rng(0)
-    shape = preset["sequence_length"], preset["batch_size"]
+    shape = preset.sequence_length, preset.batch_size
     observations = {
         key: rng.integers(0, 256, (*shape, *sub.shape), dtype=np.uint8)
         if sub.dtype == np.uint8
@@ -129,7 +130,7 @@ class Ours:
     :param device: where it trains
     """
 
-    def __init__(self, space: spaces.Dict, preset: dict[str, Any], device: str) -> None:
+    def __init__(self, space: spaces.Dict, preset: Preset, device: str) -> None:
         torch.manual_seed(0)
         box = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self.challenger = Challenger(space, box, device, preset)
@@ -162,13 +163,13 @@ class Ours:
         return {name: sum(parameter.numel() for parameter in part.parameters()) for name, part in parts.items()}
 
 
-def make_peer(preset: dict[str, Any], space: spaces.Dict, **kwargs: Any) -> Any:
+def make_peer(preset: Preset, space: spaces.Dict, **kwargs: Any) -> Any:
     """sheeprl at the sizes of a preset; None if it is not installed."""
     if not PEER:
         return None
     from peers.sheeprl_dreamer import SheeprlDreamer
 
-    return SheeprlDreamer(preset, space, ACTION_DIM, **kwargs)
+    return SheeprlDreamer(asdict(preset), space, ACTION_DIM, **kwargs)
 
 
 def print_sizes(what: str, ours: dict[str, int], peer: Any) -> None:
@@ -250,8 +251,8 @@ def measure_dreamer(options: Options, size: int, cameras: int, target: float, be
     space = make_space(size, cameras)
     for variant in variants(options):
         layers = {"cnn_layers": 3 if size == 32 else 4, "sequence_length": options.length}
-        preset = make_preset("report", **CATEGORICAL, **variant.switches, **layers)
-        preset |= {"train_task_behavior": True, "train_exploration_behavior": False}
+        dreamer = {"train_task_behavior": True, "train_exploration_behavior": False}
+        preset = make_preset("report", **CATEGORICAL, **variant.switches, **layers, **dreamer)
         ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
         peer = make_peer(preset, space, own_convolutions=own, **variant.other)
         if not own:

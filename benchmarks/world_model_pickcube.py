@@ -203,7 +203,7 @@ class Judge:
             np.zeros(rows, bool),
             np.ones(rows, bool),
         )
-        return float(challenger.world_model.loss(challenger._to_device(batch)).metrics["kl"])
+        return float(challenger.world_model.loss(challenger.learner.to_device(batch)).metrics["kl"])
 
 
 # ---------------------------------------------------------------------- training

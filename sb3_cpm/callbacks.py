@@ -26,13 +26,13 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrappe
 
 from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
-from sb3_cpm.challenger import Challenger, choose_uncertainty
+from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
 from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
-from sb3_cpm.presets import DEFAULT, make_preset
+from sb3_cpm.presets import ENTRIES, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
-from sb3_cpm.uncertainty.base import Uncertainty
+from sb3_cpm.uncertainty import Uncertainty, choose_uncertainty
 from sb3_cpm.world_model.observations import how_to_be_read, is_vector, unread
 
 _PARENTHESES = (
@@ -60,7 +60,7 @@ class ChallengerCallback(BaseCallback):
     :param preset: sizes and learning rates of the challenger, the name of one of :data:`sb3_cpm.presets.PRESETS` or a dict
     :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds (with the
         preset ``"report_images"``: all images)
-    :param uncertainty_class: estimator of epistemic uncertainty, a name or a class
+    :param uncertainty_class: estimator of epistemic uncertainty, a name or a class; None: the preset's
     :param uncertainty_kwargs: its arguments
     :param challenger_kwargs: entries of the preset to override
     :param decay: decay model of the exploration probability epsilon, a name or a function of the remaining progress,
@@ -87,7 +87,7 @@ class ChallengerCallback(BaseCallback):
         self,
         preset: str | dict[str, Any] = "default",
         keys: Sequence[str] | None = None,
-        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_class: str | type[Uncertainty] | None = None,
         uncertainty_kwargs: dict[str, Any] | None = None,
         challenger_kwargs: dict[str, Any] | None = None,
         decay: str | Schedule = "linear",
@@ -285,7 +285,7 @@ class ChallengerCallback(BaseCallback):
             return
         self._told_unread = True
         assert self.challenger is not None
-        images_only = not self.challenger.preset["read_vectors"]  # then vectors are left out on purpose
+        images_only = not self.challenger.preset.read_vectors  # then vectors are left out on purpose
         for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
             if images_only and is_vector(space):
                 continue
@@ -505,7 +505,7 @@ def _check_challenger_kwargs(given: Any) -> None:
     for name in ("preset", "keys", "uncertainty_class", "uncertainty_kwargs", "device"):
         if isinstance(given, Mapping) and name in given:
             raise ValueError(f"challenger_kwargs are entries of the preset: give {name!r} to ChallengerCallback itself.")
-    check_names("challenger_kwargs", given, DEFAULT)
+    check_names("challenger_kwargs", given, ENTRIES)
 
 
 def without_exploration(env: VecEnv | None) -> VecEnv:

@@ -137,7 +137,7 @@ class ExplorationVecEnv(WatchedVecEnv):
         self.n_actions = self.n_explored = 0
 
         self._latent = challenger.initial_state(self.num_envs)
-        self._noise = CorrelatedNoise(challenger.preset["noise_memory"], challenger.action_dim, challenger.device)
+        self._noise = CorrelatedNoise(challenger.preset.noise_memory, challenger.action_dim, challenger.device)
         self._pending: list[list[_Row]] = [[] for _ in range(self.num_envs)]
         self._explores = np.zeros(self.num_envs, dtype=bool)
         self._unit_steps = np.zeros(self.num_envs, dtype=np.int64)  # since who acts was last drawn

@@ -3,6 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from torch import nn
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.presets import make_preset
-from sb3_cpm.world_model import acceleration
 from sb3_cpm.world_model.behavior import ActorCritic, Imagination
 from sb3_cpm.world_model.distributions import TruncatedNormal
+from sb3_cpm.world_model.fast import acceleration
 from sb3_cpm.world_model.rssm import LatentState
 
 KINDS = ("dynamics", "reinforce", "both")
@@ -54,7 +55,7 @@ class Bandit(ActorCritic):
     def gradient(self, reward: Callable[[torch.Tensor], torch.Tensor], n: int = 200_000) -> torch.Tensor:
         """Of the actor's loss with respect to the two numbers, the baseline's share of the return left out."""
         stuck = LatentState(torch.zeros(n, 1), torch.zeros(n, 1), torch.zeros(n, 2))
-        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"):
+        with torch.set_grad_enabled(self.preset.actor_gradient != "reinforce"):
             imagined = self.imagine(Nothing(), stuck)  # type: ignore[arg-type]
             values = self.target_critic(imagined.next_feats).squeeze(-1)
             returns = reward(imagined.actions.squeeze(-1)) + 0.5 * values
@@ -102,8 +103,8 @@ def test_the_mixture_goes_from_one_to_the_other() -> None:
 
 
 def imagine(challenger: Challenger) -> LatentState:
-    batch = challenger._to_device(random_batch(challenger.observation_space, challenger.action_dim))
-    return challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+    batch = challenger.learner.to_device(random_batch(challenger.observation_space, challenger.action_dim))
+    return challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -114,7 +115,7 @@ def test_the_actor_learns_with_the_critic_zeroed_and_nobody_else_does(kind: str)
         for parameter in exploration.target_critic.parameters():
             parameter.zero_()
     before = weights(challenger)
-    metrics = update(challenger, start, challenger._imagined_novelty)
+    metrics = update(challenger, start, challenger.learner.imagined_novelty)
     assert metrics["exploration_actor_grad_norm"] > 0 and metrics["exploration_critic_grad_norm"] > 0
     changed = {key for key, value in weights(challenger).items() if not np.array_equal(value, before[key])}
     expected = {key for key in before if key.startswith(("exploration.actor", "exploration.critic"))}
@@ -155,7 +156,7 @@ def test_starts_that_count_for_nothing_have_no_influence(kind: str) -> None:
     found = []
     for states in (start, other):
         torch.manual_seed(0)
-        arguments = (challenger.world_model, states, challenger._imagined_novelty, challenger.optimizers)
+        arguments = (challenger.world_model, states, challenger.learner.imagined_novelty, challenger.optimizers)
         found.append((exploration.losses(*arguments, share), exploration.losses(*arguments)))
     (one, alike), (another, different) = found
     for left, right in zip((one.actor, *one.actor_gradients), (another.actor, *another.actor_gradients), strict=True):
@@ -172,7 +173,7 @@ def test_the_gradient_through_the_actors_input(horizon: int, same: bool) -> None
     challenger = small(horizon=horizon, exploration_entropy_scale=0.0)
     found = []
     for through in (True, False):
-        challenger.exploration.preset = {**challenger.exploration.preset, "actor_input_gradient": through}
+        challenger.exploration.preset = replace(challenger.exploration.preset, actor_input_gradient=through)
         torch.manual_seed(0)
         start = imagine(challenger)
         found.append(
@@ -237,12 +238,12 @@ def test_mixed_precision_is_off_by_default_and_changes_little(preset: dict[str, 
 
 def test_mixed_precision_computes_in_bfloat16_and_keeps_float32_where_it_counts() -> None:
     challenger = small(BOTH, amp=True)
-    batch, seen = challenger._to_device(random_batch(BOTH, 2)), set()
+    batch, seen = challenger.learner.to_device(random_batch(BOTH, 2)), set()
     linear = challenger.world_model.decoder.cnn.linear  # type: ignore[union-attr]
     linear.register_forward_hook(lambda module, inputs, output: seen.add(output.dtype))
     with acceleration.mixed_precision(challenger.device, True):
         output = challenger.world_model.loss(batch)
-        start = challenger._imagination_starts(batch, output)
+        start = challenger.learner.imagination_starts(batch, output)
         imagined = challenger.exploration.imagine(challenger.world_model, start)
     assert seen == {torch.bfloat16}
     kept = (*output.losses.values(), *output.metrics.values(), *output.posterior, output.embed, *imagined)

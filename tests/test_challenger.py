@@ -280,7 +280,7 @@ def test_numpy_scalars_do_not_spoil_the_file(tmp_path: pathlib.Path, number: typ
     challenger = small(gamma=number(0.5), uncertainty_kwargs=kwargs)
     challenger.save(tmp_path / "challenger.pt")
     loaded = Challenger.load(tmp_path / "challenger.pt", "cpu")
-    assert loaded.preset["gamma"] == 0.5 and loaded.uncertainty_kwargs["mean_range"] == (0.25, 1.5)
+    assert loaded.preset.gamma == 0.5 and loaded.uncertainty_kwargs["mean_range"] == (0.25, 1.5)
 
 
 def test_loading_keeps_learning_rates_that_were_asked_for_anew(tmp_path: pathlib.Path) -> None:
@@ -294,10 +294,10 @@ def test_loading_keeps_learning_rates_that_were_asked_for_anew(tmp_path: pathlib
     other.load_state(path)
     rates = {name: optimizer.adam.param_groups[0]["lr"] for name, optimizer in other.optimizers.items()}
     assert (rates["world_model"], rates["uncertainty"]) == (1e-6, 0.0)
-    assert (rates["task_actor"], rates["exploration_actor"], rates["task_critic"]) == (1e-5, 2e-4, other.preset["critic_lr"])
+    assert (rates["task_actor"], rates["exploration_actor"], rates["task_critic"]) == (1e-5, 2e-4, other.preset.critic_lr)
     other.save(path)
     again = Challenger.load(path, "cpu")
-    assert again.preset["model_lr"] == again.optimizers["world_model"].adam.param_groups[0]["lr"] == 1e-6
+    assert again.preset.model_lr == again.optimizers["world_model"].adam.param_groups[0]["lr"] == 1e-6
     assert again.optimizers["task_actor"].adam.param_groups[0]["lr"] == 1e-5
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from sb3_cpm.world_model import cuda_graphs
-from sb3_cpm.world_model.cuda_graphs import MOST_GRAPHS, WARM_UP, Graphed, GraphPool
+from sb3_cpm.world_model.fast import cuda_graphs
+from sb3_cpm.world_model.fast.cuda_graphs import MOST_GRAPHS, WARM_UP, Graphed, GraphPool
 
 
 class Double:

@@ -2,6 +2,7 @@
 
 import warnings
 from copy import deepcopy
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -364,8 +365,8 @@ def rates(model):
 
 def test_a_learning_rate_schedule_moves_all_learning_rates():
     plain = make(kind=Plan2Explore).learn(200)
-    assert rates(plain)["world_model"] == plain.learning_rate == DEFAULT["model_lr"]
-    assert rates(plain)["exploration_actor"] == DEFAULT["actor_lr"]
+    assert rates(plain)["world_model"] == plain.learning_rate == DEFAULT.model_lr
+    assert rates(plain)["exploration_actor"] == DEFAULT.actor_lr
     model = make(kind=Plan2Explore, learning_rate=lambda progress: 0.1 * progress)
     model.learn(200)
     now = rates(model)
@@ -375,7 +376,7 @@ def test_a_learning_rate_schedule_moves_all_learning_rates():
         ("critic_lr", "exploration_critic"),
         ("uncertainty_lr", "uncertainty"),
     ):
-        assert now[name] == pytest.approx(now["world_model"] * DEFAULT[entry] / DEFAULT["model_lr"])
+        assert now[name] == pytest.approx(now["world_model"] * getattr(DEFAULT, entry) / DEFAULT.model_lr)
 
 
 def test_a_frozen_world_model():
@@ -385,7 +386,7 @@ def test_a_frozen_world_model():
     model = Dreamer(**arguments, preset=frozen)
     task = part(model.challenger, "task").detach().clone()
     model.learn(30)
-    assert rates(model) == {"world_model": 0.0, "task_actor": DEFAULT["actor_lr"], "task_critic": DEFAULT["critic_lr"]}
+    assert rates(model) == {"world_model": 0.0, "task_actor": DEFAULT.actor_lr, "task_critic": DEFAULT.critic_lr}
     assert th.equal(part(model.challenger, "world_model"), part(explorer.challenger, "world_model"))
     assert model._n_updates > 0 and not th.equal(part(model.challenger, "task"), task)
     with pytest.raises(ValueError, match="'model_lr' is 0, .*`learning_rate`.*leave one of them out"):
@@ -457,7 +458,7 @@ def test_dreamer_starts_from_what_was_explored(tmp_path, source, task):
     assert th.equal(moments[0][0]["exp_avg"], moments[1][0]["exp_avg"]) and moments[0][0]["exp_avg"].abs().sum() > 0
     if task:
         assert th.equal(part(model.challenger, "task"), part(explored, "task"))
-    assert model.challenger.preset["deter_size"] == TINY["deter_size"], "its sizes, too"
+    assert model.challenger.preset.deter_size == TINY["deter_size"], "its sizes, too"
     before = part(explored, "world_model").clone()
     model.learn(120)
     assert th.equal(part(explored, "world_model"), before), "the original is left alone"
@@ -467,7 +468,7 @@ def test_dreamer_starts_from_what_was_explored(tmp_path, source, task):
 def test_what_can_change_at_the_start_and_what_cannot(tmp_path):
     explorer = make(kind=Plan2Explore)
     model = Dreamer("MultiInputPolicy", toy(), start_from=explorer, preset={"gamma": 0.9, "actor_lr": 0.5}, device="cpu")
-    assert model.gamma == model.challenger.preset["gamma"] == 0.9
+    assert model.gamma == model.challenger.preset.gamma == 0.9
     model.learning_starts, model.train_freq = 50, type(model.train_freq)(10, model.train_freq.unit)
     model.learn(60)
     assert model.challenger.optimizers["task_actor"].adam.param_groups[0]["lr"] == 0.5
@@ -613,7 +614,7 @@ def test_a_loaded_model_takes_other_rates_and_constants(tmp_path, kind):
     changed = {"model_lr": 5e-4, "actor_lr": 2e-5, "adam_eps": 1e-4, "horizon": 3, "batch_size": 2, "gamma": 0.5}
     loaded = kind.load(tmp_path / "model", env=toy(), device="cpu", preset=changed, keys=["state"])
     assert_same_weights(model, loaded)
-    assert loaded.challenger.preset == {**model.challenger.preset, **changed}
+    assert loaded.challenger.preset == replace(model.challenger.preset, **changed)
     assert loaded.learning_rate == 5e-4 and loaded.batch_size == 2 and loaded.gamma == 0.5
     model.save_replay_buffer(tmp_path / "buffer")
     loaded.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=False)

@@ -19,7 +19,7 @@ from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetExtractor
 from sb3_cpm.agents.checks import check_hyperparameters
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.dreamer.spaces import as_dict_space
-from sb3_cpm.presets import REPORT, make_preset
+from sb3_cpm.presets import ENTRIES, make_preset
 from sb3_cpm.spaces import looks_like_cloud
 from sb3_cpm.world_model.networks import Encoder
 from sb3_cpm.world_model.observations import ObservationSpec, is_rangeless_image, unread
@@ -398,11 +398,11 @@ def test_arguments_of_the_callback(given):
 
 
 @FUZZ
-@given(given=st.dictionaries(st.sampled_from(sorted(REPORT)), anything, max_size=3))
+@given(given=st.dictionaries(st.sampled_from(sorted(ENTRIES)), anything, max_size=3))
 def test_entries_of_presets(given):
     with contextlib.suppress(Refused), explained():
         complete = make_preset(given)
-        assert all(complete[key] == value for key, value in given.items())
+        assert all(getattr(complete, key) == value for key, value in given.items())
 
 
 @FUZZ

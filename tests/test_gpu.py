@@ -11,7 +11,7 @@ from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, weights
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty import Plan2Explore, Transitions
-from sb3_cpm.world_model.cuda_graphs import Graphed, GraphPool
+from sb3_cpm.world_model.fast.cuda_graphs import Graphed, GraphPool
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 CATEGORICAL = {"latent": "categorical", "stoch_size": 4, "stoch_classes": 5}
@@ -58,8 +58,8 @@ def test_it_computes_what_a_cpu_computes(latent: dict[str, Any], monkeypatch: py
 
         with monkeypatch.context() as patch:
             patch.setattr(kind, "noise", noise)
-            sequences = challenger._to_device(whole())
-            output, gradients = challenger._learn_model(*sequences.inputs, *sequences[1:])
+            sequences = challenger.learner.to_device(whole())
+            output, gradients = challenger.learner.learn_model(*sequences.inputs, *sequences[1:])
         results.append([part.cpu() for part in (*output.losses.values(), *output.posterior, *gradients)])
     for one, other in zip(*results, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
@@ -74,7 +74,7 @@ def test_cuda_graphs_compute_the_same(latent: dict[str, Any], kind: str) -> None
         assert challenger.compiled is compiled
         torch.manual_seed(0)
         results.append([challenger.train(whole(seed)) for seed in range(6)])
-    assert len(challenger._graphs["world model"].recordings) == 1
+    assert len(challenger.learner.graphs.functions["world model"].recordings) == 1
     for one, other in zip(*results, strict=True):
         assert one == pytest.approx(other, rel=1e-2, abs=1e-3)
 
@@ -91,7 +91,7 @@ def test_cuda_graphs_for_batches_of_any_shape_with_missing_rows() -> None:
         batch = random_batch(BOTH, 2, length=length)
         batch.mask[-2:, 1] = False
         assert all(np.isfinite(value) for value in challenger.train(batch).values())
-    assert len(challenger._graphs["world model"].recordings) == 2
+    assert len(challenger.learner.graphs.functions["world model"].recordings) == 2
 
 
 class Looks(Plan2Explore):

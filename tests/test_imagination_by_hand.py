@@ -9,9 +9,9 @@ from challenger_helpers import SMALL, VECTOR, random_batch, small
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.world_model.behavior import ActorCritic, BehaviorLosses
-from sb3_cpm.world_model.by_hand import Returns, through
+from sb3_cpm.world_model.by_hand.dream import Dream
+from sb3_cpm.world_model.by_hand.returns import Returns, through
 from sb3_cpm.world_model.distributions import OutputSampler, TruncatedNormal
-from sb3_cpm.world_model.dream import Dream
 from sb3_cpm.world_model.losses import lambda_returns
 from sb3_cpm.world_model.networks import MLP
 
@@ -24,10 +24,10 @@ def behaviour_losses(challenger: Challenger, by_hand: bool, monkeypatch: pytest.
         if not by_hand:
             patch.setattr(ActorCritic, "_learns_by_hand", lambda *arguments: False)
         torch.manual_seed(0)
-        batch = challenger._to_device(random_batch(VECTOR, challenger.action_dim))
-        start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+        batch = challenger.learner.to_device(random_batch(VECTOR, challenger.action_dim))
+        start = challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
         share = torch.linspace(0.0, 2.0, len(start.deter))
-        return [challenger._learn_behavior(name, *start, share) for name in challenger.behaviors]
+        return [challenger.learner.learn_behavior(name, *start, share) for name in challenger.behaviors]
 
 
 def assert_alike(found: list[BehaviorLosses], expected: list[BehaviorLosses]) -> None:

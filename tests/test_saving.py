@@ -376,7 +376,7 @@ def test_a_challenger_that_is_not_finite_is_refused_at_load(where: str, tmp_path
             next(iter(adam.state.values()))["exp_avg"].view(-1)[0] = th.inf
     with pytest.raises(NotFiniteError, match="The challenger is not saved"):
         challenger.save(path)
-    monkeypatch.setattr("sb3_cpm.challenger.check_finite", lambda *_: None)  # as somebody else may have written it
+    monkeypatch.setattr("sb3_cpm.challenger.challenger.check_finite", lambda *_: None)  # as somebody else may have written it
     challenger.save(path)
     told = r"whose weight (world_model\.reward_head\.0\.weight|optimizers\.world_model\S*exp_avg) is not finite"
     for read in (lambda: Challenger.load(path, "cpu"), lambda: small().load_state(path)):

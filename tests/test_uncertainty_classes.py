@@ -11,12 +11,13 @@ from gymnasium import spaces
 
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.challenger.file import read_file
+from sb3_cpm.challenger.learning import real_transitions
 from sb3_cpm.presets import PRESETS
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES, Transitions
 from sb3_cpm.uncertainty.base import LatentSizes, Uncertainty
 from sb3_cpm.uncertainty.parts import RunningNorm
-from sb3_cpm.world_model.checkpoint import read_file
 
 SIZES = LatentSizes(feat=8, action=2, stoch=3, deter=5, embed=6)
 CATEGORICAL = {**SMALL, "latent": "categorical", "stoch_size": 4, "stoch_classes": 5}
@@ -153,9 +154,9 @@ def test_arguments_that_no_file_can_hold_are_refused(weights: Any) -> None:
 def test_each_moves_the_exploration_actor(name: str, kwargs: dict[str, Any]) -> None:
     """In imagination, with the critic zeroed: the gradient comes from the measure, through action and dynamics."""
     challenger = small(BOTH, uncertainty_class=name, uncertainty_kwargs={"layers": 1, "units": 16, **kwargs})
-    batch = challenger._to_device(random_batch(BOTH, 2))
-    start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
-    novelty = challenger._imagined_novelty(challenger.exploration.imagine(challenger.world_model, start))
+    batch = challenger.learner.to_device(random_batch(BOTH, 2))
+    start = challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
+    novelty = challenger.learner.imagined_novelty(challenger.exploration.imagine(challenger.world_model, start))
     assert novelty.shape == (SMALL["horizon"], len(start.deter)) and (novelty >= 0.0).all()
     for step in (0, 3):
         gradients = torch.autograd.grad(
@@ -166,7 +167,7 @@ def test_each_moves_the_exploration_actor(name: str, kwargs: dict[str, Any]) -> 
 
 def test_presets_name_every_class() -> None:
     for preset in PRESETS.values():
-        assert set(preset["uncertainty"]) == set(UNCERTAINTY_CLASSES)
+        assert set(preset.uncertainty) == set(UNCERTAINTY_CLASSES)
     for name in UNCERTAINTY_CLASSES:
         assert np.isfinite(Challenger(VECTOR, box(2), "cpu", uncertainty_class=name).train(random_batch(VECTOR, 2))["kl"])
 
@@ -254,9 +255,9 @@ class Watched:
     def transitions(self, n: int) -> tuple[Transitions, torch.Tensor]:
         """Transitions, and whether the television shows noise after them."""
         batch = self.television.batch(self.rng, n, 15)
-        sequences = self.challenger._to_device(batch)
+        sequences = self.challenger.learner.to_device(batch)
         output = self.challenger.world_model.loss(sequences)
-        pairs = self.challenger._transitions(output.posterior, sequences.actions, output.embed)
+        pairs = real_transitions(self.challenger.world_model, output.posterior, sequences.actions, output.embed)
         flat = Transitions(*(part.flatten(0, 1) for part in pairs if part is not None))
         return flat, torch.as_tensor(batch.actions[1:, :, 1] > 0).flatten()
 

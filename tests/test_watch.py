@@ -7,6 +7,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import torch
 from challenger_helpers import BOTH, VECTOR, random_batch, small, weights
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -65,7 +66,7 @@ def test_open_loop_is_what_the_world_model_imagines() -> None:
     first = np.arange(9)[:, None] == 0
     seen = {key: value[:3, None] for key, value in observations.items()}
     state = challenger.follow(challenger.initial_state(1), seen, rows[:3], first[:3], deterministic=True)
-    expected = challenger.world_model.open_loop(state, challenger._tensor(actions[2:, None]))["state"][:, 0]
+    expected = challenger.world_model.open_loop(state, torch.as_tensor(actions[2:, None]))["state"][:, 0]
     assert np.allclose(drawn.observations["state"][3:], expected.detach().numpy(), atol=1e-5)
 
 

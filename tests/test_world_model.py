@@ -1,6 +1,7 @@
 """Parts of the world model one by one: observations, networks, distributions, losses, latent states."""
 
 import math
+from dataclasses import FrozenInstanceError, asdict, replace
 
 import numpy as np
 import pytest
@@ -259,20 +260,25 @@ def test_masked_rows_keep_the_state() -> None:
 # ---- presets ---------------------------------------------------------------------------------------------------------
 
 
-def test_presets_have_the_same_entries_and_are_copied() -> None:
-    assert set(PRESETS["report"]) == set(PRESETS["default"]) == set(PRESETS["report_images"])
-    make_preset("report")["gamma"] = 0.0
-    assert PRESETS["report"]["gamma"] == 0.99
-    assert (PRESETS["report"]["deter_size"], PRESETS["report"]["stoch_size"], PRESETS["report"]["horizon"]) == (200, 50, 15)
-    assert make_preset({"horizon": 3}, gamma=0.5)["horizon"] == 3
+def test_presets_are_frozen_and_made_of_names_entries_and_presets() -> None:
+    report = PRESETS["report"]
+    assert (report.gamma, report.deter_size, report.stoch_size, report.horizon) == (0.99, 200, 50, 15)
+    with pytest.raises(FrozenInstanceError):
+        report.gamma = 0.0  # type: ignore[misc]
+    with pytest.raises(ValueError, match="'gamma' must be a number from 0 to 1, got 2"):
+        replace(report, gamma=2)
+    make_preset("report").uncertainty["rnd"]["layers"] = 9  # type: ignore[index]
+    assert report.uncertainty["rnd"]["layers"] == 3, "a copy"
+    assert make_preset({"horizon": 3}, gamma=0.5).horizon == 3
+    assert make_preset(report, horizon=3) == replace(report, horizon=3)
     for preset in PRESETS:
-        assert make_preset(preset) == PRESETS[preset]
+        assert make_preset(preset) == make_preset(asdict(PRESETS[preset])) == PRESETS[preset]
 
 
 def test_numpy_scalars_become_plain_numbers() -> None:
     layers = {"rnd": {"layers": np.int8(2)}}
     preset = make_preset(gamma=np.float64(0.97), horizon=np.int64(3), amp=np.bool_(False), uncertainty=layers)
-    values = preset["gamma"], preset["horizon"], preset["amp"], preset["uncertainty"]["rnd"]["layers"]
+    values = preset.gamma, preset.horizon, preset.amp, preset.uncertainty["rnd"]["layers"]
     assert values == (0.97, 3, False, 2) and [type(value) for value in values] == [float, int, bool, int]
 
 

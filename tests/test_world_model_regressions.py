@@ -26,8 +26,8 @@ CATEGORICAL = {**SMALL, "latent": "categorical", "stoch_size": 4, "stoch_classes
 
 def imagine(challenger: Challenger, seed: int = 0) -> Any:
     """One imagination from states of a random batch."""
-    batch = challenger._to_device(random_batch(challenger.observation_space, challenger.action_dim, seed=seed))
-    start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+    batch = challenger.learner.to_device(random_batch(challenger.observation_space, challenger.action_dim, seed=seed))
+    start = challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
     return challenger.exploration.imagine(challenger.world_model, start)
 
 
@@ -164,7 +164,7 @@ def test_08_every_number_of_actions_works(space: Any, action_dim: int) -> None:
 def test_09_every_camera_is_scaled() -> None:
     """9: the second camera entered unscaled, 0 to 255, and 32x32 images did not work."""
     challenger = small(BOTH)
-    images = challenger._to_device(random_batch(BOTH, 2)).inputs.images
+    images = challenger.learner.to_device(random_batch(BOTH, 2)).inputs.images
     assert images is not None and images.shape[1:] == (6, 32, 32)
     for camera in images.split(3, dim=1):
         assert -0.5 <= camera.min() < -0.4 and 0.4 < camera.max() <= 0.5
@@ -196,7 +196,7 @@ def test_10_termination_ends_the_return_and_truncation_bootstraps() -> None:
     batch.is_terminal[:] = batch.observations["state"][..., 0] > 0
     for _ in range(150):
         challenger.train(batch)
-    sequences = challenger._to_device(batch)
+    sequences = challenger.learner.to_device(batch)
     goes_on = challenger.world_model.continue_probability(challenger.world_model.loss(sequences).posterior.feat)
     assert goes_on[sequences.is_terminal].mean() < 0.3 < 0.7 < goes_on[~sequences.is_terminal].mean()
 
@@ -205,8 +205,8 @@ def test_10_imagination_does_not_start_where_an_episode_ended() -> None:
     """10: there is nothing to be imagined behind a termination."""
     challenger, batch = small(imagination_starts=None), random_batch(VECTOR, 2)
     batch.mask[6:, 3] = False
-    sequences = challenger._to_device(batch)
-    start = challenger._imagination_starts(sequences, challenger.world_model.loss(sequences))
+    sequences = challenger.learner.to_device(batch)
+    start = challenger.learner.imagination_starts(sequences, challenger.world_model.loss(sequences))
     assert len(start.deter) == (batch.mask & ~batch.is_terminal).sum()
 
 
@@ -231,10 +231,10 @@ def test_11_save_load_train_is_train(tmp_path: Any, preset: dict) -> None:
 def test_12_behaviour_does_not_train_the_world_model() -> None:
     """12: the exploration update back-propagated into the world model."""
     challenger = small()
-    batch = challenger._to_device(random_batch(VECTOR, 2))
-    start = challenger._imagination_starts(batch, challenger.world_model.loss(batch))
+    batch = challenger.learner.to_device(random_batch(VECTOR, 2))
+    start = challenger.learner.imagination_starts(batch, challenger.world_model.loss(batch))
     before = weights(challenger)
-    update(challenger, start, challenger._imagined_novelty)
+    update(challenger, start, challenger.learner.imagined_novelty)
     assert all(parameter.grad is None for network in challenger.networks.values() for parameter in network.parameters())
     after = weights(challenger)
     changed = {key for key, value in before.items() if not np.array_equal(value, after[key])}
@@ -281,7 +281,7 @@ def test_14_state_and_action_are_paired_so_that_they_tell_the_next_state() -> No
         actions = torch.rand(8, 16, 2) * 2 - 1
         rows = torch.cat((actions, torch.zeros(8, 16, 14)), dim=-1)
         batch, output = crafted(challenger, rows, actions, torch.zeros(8, 16, dtype=torch.bool))
-        losses.append(challenger._train_uncertainty(batch, output)["uncertainty_loss"].item())
+        losses.append(challenger.learner.train_uncertainty(batch, output)["uncertainty_loss"].item())
     assert np.mean(losses[-20:]) < 0.02 * losses[0]
 
 
@@ -295,7 +295,9 @@ def test_15_no_transition_crosses_an_episode_boundary() -> None:
         is_first = torch.zeros(5, 2, dtype=torch.bool)
         is_first[4] = True
         rows[4] = value
-        losses.append(challenger._train_uncertainty(*crafted(challenger, rows, actions, is_first))["uncertainty_loss"].item())
+        losses.append(
+            challenger.learner.train_uncertainty(*crafted(challenger, rows, actions, is_first))["uncertainty_loss"].item()
+        )
     assert losses[0] == losses[1]
 
 
@@ -352,7 +354,7 @@ def test_18_novelty_itself_moves_the_actor() -> None:
         for parameter in challenger.exploration.target_critic.parameters():
             parameter.zero_()
     imagined = imagine(challenger)
-    novelty = challenger._imagined_novelty(imagined)
+    novelty = challenger.learner.imagined_novelty(imagined)
     assert novelty.shape == (SMALL["horizon"], len(imagined.feats[0]))
     for step in (0, 3):  # through the action at once, and through the dynamics later
         gradients = torch.autograd.grad(

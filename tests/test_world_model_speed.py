@@ -12,16 +12,16 @@ from torch import nn
 from sb3_cpm.uncertainty import heads as heads_module
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import root
-from sb3_cpm.world_model import acceleration, activation, one_hot
-from sb3_cpm.world_model import linear as linear_module
-from sb3_cpm.world_model.acceleration import cache_slices
-from sb3_cpm.world_model.activation import ELU, elu_
-from sb3_cpm.world_model.deconvolution import Deconvolution
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent
-from sb3_cpm.world_model.linear import Linear, affine, frozen, is_faster, linear
+from sb3_cpm.world_model.fast import acceleration, activation, one_hot
+from sb3_cpm.world_model.fast import linear as linear_module
+from sb3_cpm.world_model.fast.acceleration import cache_slices
+from sb3_cpm.world_model.fast.activation import ELU, elu_
+from sb3_cpm.world_model.fast.deconvolution import Deconvolution
+from sb3_cpm.world_model.fast.linear import Linear, affine, is_faster, linear
+from sb3_cpm.world_model.fast.one_hot import OneHot, OneHotLinear, find_choice
 from sb3_cpm.world_model.losses import squared_error
-from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder
-from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear, find_choice
+from sb3_cpm.world_model.networks import MLP, ConvDecoder, ConvEncoder, frozen
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 
 LATENTS = [GaussianLatent(4), CategoricalLatent(3, 5)]
@@ -177,7 +177,7 @@ def test_the_scan_by_hand_is_the_plain_one(latent: Any, monkeypatch: pytest.Monk
 
 def test_the_scan_by_hand_trains_and_everything_else_does_not_use_it() -> None:
     challenger = small(BOTH)
-    output = challenger.world_model.loss(challenger._to_device(random_batch(BOTH, 2)))
+    output = challenger.world_model.loss(challenger.learner.to_device(random_batch(BOTH, 2)))
     names, nodes = set(), [output.losses["kl"].grad_fn]
     while nodes:
         node = nodes.pop()
@@ -188,7 +188,7 @@ def test_the_scan_by_hand_trains_and_everything_else_does_not_use_it() -> None:
     rssm, embed = challenger.world_model.rssm, torch.zeros(1, requires_grad=True)
     assert rssm._trains_by_hand(embed) and not rssm._trains_by_hand(embed.detach())
     with torch.autocast("cpu", dtype=torch.bfloat16):  # it keeps float32 then
-        output = challenger.world_model.loss(challenger._to_device(random_batch(BOTH, 2)))
+        output = challenger.world_model.loss(challenger.learner.to_device(random_batch(BOTH, 2)))
     assert {part.dtype for part in output.posterior} == {torch.float32}
     rssm._compiled_call_impl = rssm._call_impl  # what torch.compile leaves behind
     assert not rssm._trains_by_hand(embed)

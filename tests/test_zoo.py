@@ -847,8 +847,8 @@ class TestGoingOn:
         _, folder = run_dreamer({})
         agent = str(folder / f"{TOY}.zip")
         model, _ = run_dreamer({"model_lr": 5e-4, "horizon": 4}, trained_agent=agent)
-        assert model.challenger.preset["model_lr"] == model.lr_schedule(1.0) == 5e-4
-        assert model.challenger.preset["horizon"] == 4 and model.num_timesteps == 120
+        assert model.challenger.preset.model_lr == model.lr_schedule(1.0) == 5e-4
+        assert model.challenger.preset.horizon == 4 and model.num_timesteps == 120
         with pytest.raises(ValueError, match=r"cannot be loaded with \{'deter_size': 9\}"):
             run_dreamer({"deter_size": 9}, trained_agent=agent)
 

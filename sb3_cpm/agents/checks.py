@@ -37,11 +37,11 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
 from sb3_cpm.buffers.cpm_buffer import ONE_STEP
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.challenger import check_uncertainties, choose_uncertainty
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
 from sb3_cpm.presets import make_preset
+from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
 
 #: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
 ZOO_KEYS = (

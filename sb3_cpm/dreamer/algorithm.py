@@ -11,6 +11,7 @@ import pathlib
 import warnings
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any, ClassVar
 
@@ -32,15 +33,15 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import check_environment
 from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
 from sb3_cpm.challenger import Challenger, choose_device, rate_entry
+from sb3_cpm.challenger.file import state_to_check
 from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
 from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
 from sb3_cpm.dreamer.start import StartFrom, model_file, read_challenger, take_over_uncertainty
 from sb3_cpm.files import check_finite, verify, write_sealed
-from sb3_cpm.presets import make_preset
+from sb3_cpm.presets import Preset, PresetLike, make_preset
 from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.type_aliases import SequenceBatch
-from sb3_cpm.world_model.checkpoint import state_to_check
 from sb3_cpm.world_model.correlated_noise import CorrelatedNoise
 from sb3_cpm.world_model.observations import check_action_space, how_to_be_read, unread
 
@@ -77,7 +78,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         action_noise: ActionNoise | None,
         replay_buffer_class: type[ReplayBuffer] | None,
         replay_buffer_kwargs: dict[str, Any] | None,
-        preset: str | Mapping[str, Any] | None,
+        preset: PresetLike | None,
         entries: Mapping[str, Any],
         keys: Sequence[str] | None,
         start_from: StartFrom | None,
@@ -92,24 +93,24 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         source = None if start_from is None else read_challenger(start_from, choose_device(device))
         if source is not None:
             keys = source.keys if keys is None else keys
-            preset = {**source.preset, **(preset or {})} if not isinstance(preset, str) else preset
+            preset = preset if isinstance(preset, (str, Preset)) else {**asdict(source.preset), **(preset or {})}
         sizes = make_preset(self.default_preset if preset is None else preset, self.default_preset, **entries)
-        if learning_rate is not None and sizes["model_lr"] == 0.0:
+        if learning_rate is not None and sizes.model_lr == 0.0:
             raise ValueError(
                 f"The preset entry 'model_lr' is 0, which keeps the world model from learning, and `learning_rate`, "
                 f"{learning_rate}, is the world model's too: leave one of them out. The other rates are preset entries."
             )
-        policy_kwargs = {"preset": sizes, "keys": keys, **(policy_kwargs or {}), "behavior": self.behavior}
-        if sizes["train_exploration_behavior"]:
+        policy_kwargs = {"preset": asdict(sizes), "keys": keys, **(policy_kwargs or {}), "behavior": self.behavior}
+        if sizes.train_exploration_behavior:
             policy_kwargs.update(take_over_uncertainty(source, sizes, policy_kwargs))
         super().__init__(
             policy,
             env,
-            sizes["model_lr"] if learning_rate is None else learning_rate,
+            sizes.model_lr if learning_rate is None else learning_rate,
             buffer_size,
             learning_starts,
-            sizes["batch_size"],
-            gamma=sizes["gamma"],
+            sizes.batch_size,
+            gamma=sizes.gamma,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
             action_noise=action_noise,
@@ -262,7 +263,7 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """What exploration is made of; a behaviour that is to solve the task has white noise, which it learns with."""
         if self.behavior != "exploration":
             return None
-        return CorrelatedNoise(self.challenger.preset["noise_memory"], self.challenger.action_dim, self.challenger.device)
+        return CorrelatedNoise(self.challenger.preset.noise_memory, self.challenger.action_dim, self.challenger.device)
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """As SB3's, through an environment that keeps last observations as they were, and sees whether others use it."""
@@ -341,12 +342,11 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
         """
         rate = self.lr_schedule(self._current_progress_remaining)
         preset = self.challenger.preset
-        frozen = preset["model_lr"] == 0.0
+        frozen = preset.model_lr == 0.0
         self.logger.record("train/learning_rate", 0.0 if frozen else rate)
         for name, optimizer in self.challenger.optimizers.items():
-            own = preset[rate_entry(name)]
-            for group in optimizer.adam.param_groups:
-                group["lr"] = own if frozen else rate * own / preset["model_lr"]
+            own = getattr(preset, rate_entry(name))
+            optimizer.learning_rate = own if frozen else rate * own / preset.model_lr
 
     def _normalized(self, batch: SequenceBatch) -> SequenceBatch:
         """The buffer holds what the environment gave; behind a VecNormalize, what acts sees normalized observations."""
@@ -431,14 +431,14 @@ class DreamerAlgorithm(OffPolicyAlgorithm):
             data, _, _ = load_from_zip_file(path, custom_objects=custom_objects, device="cpu")
             assert data is not None
             saved, wanted = data["policy_kwargs"], _changed(data["policy_kwargs"], given)
-            preset = wanted["preset"]
+            preset = make_preset(wanted["preset"])
             changes = {name: value for name, value in wanted.items() if name != "preset" and value != saved[name]}
             before = make_preset(saved["preset"])  # of an earlier version it may lack entries
-            changes |= {name: value for name, value in preset.items() if value != before[name]}
+            changes |= {name: value for name, value in asdict(preset).items() if value != getattr(before, name)}
             objects["policy_kwargs"] = wanted
-            kwargs = {"batch_size": preset["batch_size"], "gamma": preset["gamma"], **kwargs}
+            kwargs = {"batch_size": preset.batch_size, "gamma": preset.gamma, **kwargs}
             if "model_lr" in changes:
-                kwargs = {"learning_rate": preset["model_lr"], **kwargs}
+                kwargs = {"learning_rate": preset.model_lr, **kwargs}
         try:
             model = super().load(path, env, device, objects, print_system_info, force_reset, **kwargs)
         except (RuntimeError, TypeError, ValueError) as error:
@@ -495,9 +495,9 @@ def _changed(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     preset = given.get("preset", {})
     entries = {name: saved["preset"][name] for name in ("train_task_behavior", "train_exploration_behavior")}
     entries.update((name, given[name]) for name in ("train_task_behavior",) if name in given)
-    complete = make_preset(preset if isinstance(preset, str) else {**saved["preset"], **preset}, **entries)
+    complete = make_preset(preset if isinstance(preset, (str, Preset)) else {**saved["preset"], **preset}, **entries)
     rest = {name: given[name] for name in ("keys", "uncertainty_class", "uncertainty_kwargs") if name in given}
-    return {**saved, **rest, "preset": complete}
+    return {**saved, **rest, "preset": asdict(complete)}
 
 
 class _Spaces:

@@ -2,7 +2,7 @@
 DreamerV2 as an SB3 algorithm (Hafner et al. 2021; report, B.1): acts with the behaviour that was learnt in imagination.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch as th
@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.dreamer.policies import DreamerPolicy
 from sb3_cpm.dreamer.start import StartFrom
+from sb3_cpm.presets import PresetLike
 
 
 class Dreamer(DreamerAlgorithm):
@@ -71,7 +72,7 @@ class Dreamer(DreamerAlgorithm):
         action_noise: ActionNoise | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
-        preset: str | Mapping[str, Any] | None = None,
+        preset: PresetLike | None = None,
         keys: Sequence[str] | None = None,
         start_from: StartFrom | None = None,
         policy_kwargs: dict[str, Any] | None = None,

@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.dreamer.policies import DreamerPolicy
 from sb3_cpm.dreamer.start import StartFrom
+from sb3_cpm.presets import PresetLike
 from sb3_cpm.uncertainty.base import Uncertainty
 
 
@@ -77,7 +78,7 @@ class Plan2Explore(DreamerAlgorithm):
         uncertainty_class: str | type[Uncertainty] | None = None,
         uncertainty_kwargs: Mapping[str, Any] | None = None,
         train_task_behavior: bool = False,
-        preset: str | Mapping[str, Any] | None = None,
+        preset: PresetLike | None = None,
         keys: Sequence[str] | None = None,
         start_from: StartFrom | None = None,
         policy_kwargs: dict[str, Any] | None = None,

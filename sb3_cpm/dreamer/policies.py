@@ -16,6 +16,7 @@ from typing_extensions import Self
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer.spaces import OBSERVATION, as_dict, as_dict_space
+from sb3_cpm.presets import PresetLike
 from sb3_cpm.uncertainty.base import Uncertainty
 from sb3_cpm.world_model.observations import to_tensor
 from sb3_cpm.world_model.rssm import LatentState
@@ -47,7 +48,7 @@ class DreamerPolicy(BasePolicy):
         observation_space: spaces.Space,
         action_space: spaces.Box,
         lr_schedule: Schedule | None = None,
-        preset: str | Mapping[str, Any] = "default",
+        preset: PresetLike = "default",
         keys: Sequence[str] | None = None,
         uncertainty_class: str | type[Uncertainty] = "plan2explore",
         uncertainty_kwargs: Mapping[str, Any] | None = None,

@@ -9,9 +9,10 @@ import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_cpm.challenger import Challenger
+from sb3_cpm.challenger.file import is_model
 from sb3_cpm.files import verify
+from sb3_cpm.presets import Preset
 from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
-from sb3_cpm.world_model.checkpoint import is_model
 
 
 class HasChallenger(Protocol):
@@ -52,7 +53,7 @@ def model_file(path: str | os.PathLike) -> Path:
     return zipped if not given.exists() and zipped.exists() else given
 
 
-def take_over_uncertainty(source: Challenger | None, preset: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def take_over_uncertainty(source: Challenger | None, preset: Preset, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     Uncertainty class and arguments: those of the one to start from, but for what is given.
 
@@ -69,7 +70,7 @@ def take_over_uncertainty(source: Challenger | None, preset: Mapping[str, Any], 
     if kind not in (None, theirs):
         return {"uncertainty_class": kind, "uncertainty_kwargs": kwargs}
     # what the source was built with has its preset's arguments in it already; those of another preset are newer
-    changed = preset["uncertainty"].get(name, {}) if preset["uncertainty"] != source.preset["uncertainty"] else {}
+    changed = preset.uncertainty.get(name, {}) if preset.uncertainty != source.preset.uncertainty else {}
     return {"uncertainty_class": theirs, "uncertainty_kwargs": {**source.uncertainty_kwargs, **changed, **(kwargs or {})}}
 
 

@@ -12,17 +12,11 @@ prediction_error      what was predicted badly                      high for eve
 """
 
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty
+from sb3_cpm.uncertainty.choice import UNCERTAINTY_CLASSES, check_uncertainties, choose_uncertainty
 from sb3_cpm.uncertainty.observation_ensemble import ObservationEnsemble
 from sb3_cpm.uncertainty.plan2explore import Plan2Explore
 from sb3_cpm.uncertainty.prediction_error import PredictionError
 from sb3_cpm.uncertainty.rnd import RandomNetworkDistillation
-
-UNCERTAINTY_CLASSES: dict[str, type[Uncertainty]] = {
-    "plan2explore": Plan2Explore,
-    "rnd": RandomNetworkDistillation,
-    "prediction_error": PredictionError,
-    "observation_ensemble": ObservationEnsemble,
-}
 
 __all__ = [
     "UNCERTAINTY_CLASSES",
@@ -32,4 +26,6 @@ __all__ = [
     "RandomNetworkDistillation",
     "Transitions",
     "Uncertainty",
+    "check_uncertainties",
+    "choose_uncertainty",
 ]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from sb3_cpm.world_model.one_hot import OneHot
+from sb3_cpm.world_model.fast.one_hot import OneHot
 
 
 class Transitions(NamedTuple):
@@ -100,3 +100,19 @@ class Uncertainty(nn.Module, ABC):
         :return: numbers worth logging, detached scalars
         """
         return {"disagreement": self.novelty(transitions).mean().detach()}
+
+
+def checked_novelty(uncertainty: Uncertainty, transitions: Transitions) -> torch.Tensor:
+    """
+    :param uncertainty: who says what is new, perhaps a class of the user's own
+    :param transitions: real or imagined
+    :return: how new each of them is, shape ``(*batch,)``
+    :raises ValueError: unless it gives a number per transition: others might be broadcast unnoticed
+    """
+    novelty, expected = uncertainty.novelty(transitions), transitions.feat.shape[:-1]
+    if novelty.shape != expected:
+        raise ValueError(
+            f"The uncertainty {type(uncertainty).__qualname__} gave a novelty of shape {tuple(novelty.shape)} for transitions "
+            f"of shape {tuple(expected)}: it must be one number for each."
+        )
+    return novelty

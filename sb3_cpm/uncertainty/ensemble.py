@@ -9,11 +9,11 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_cpm.uncertainty.heads import Disagreement, Predictions, Rating
-from sb3_cpm.world_model.acceleration import is_plain
-from sb3_cpm.world_model.activation import elu_
-from sb3_cpm.world_model.linear import is_large
+from sb3_cpm.world_model.fast.acceleration import is_plain
+from sb3_cpm.world_model.fast.activation import elu_
+from sb3_cpm.world_model.fast.linear import is_large
+from sb3_cpm.world_model.fast.one_hot import Choice, OneHot, find_choice
 from sb3_cpm.world_model.losses import squared_error
-from sb3_cpm.world_model.one_hot import Choice, OneHot, find_choice
 
 
 class Ensemble(nn.Module):

@@ -13,10 +13,10 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
-from sb3_cpm.world_model.acceleration import cache_slices
-from sb3_cpm.world_model.activation import elu_, elu_gradient_
-from sb3_cpm.world_model.linear import add_product_, affine, multiply
-from sb3_cpm.world_model.one_hot import Choice
+from sb3_cpm.world_model.fast.acceleration import cache_slices
+from sb3_cpm.world_model.fast.activation import elu_, elu_gradient_
+from sb3_cpm.world_model.fast.linear import add_product_, affine, multiply
+from sb3_cpm.world_model.fast.one_hot import Choice
 
 RATED_ROWS = 1024  # states that go through all heads before the next ones
 

@@ -7,8 +7,6 @@ the encoder has never seen decoded pictures. A small head that reads the embeddi
 on the side, and differentiable, so that the actor's gradient passes through it.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import nn
 
@@ -83,8 +81,3 @@ class DreamtEmbedding(nn.Module):
     def loss(self, feat: torch.Tensor, embed: torch.Tensor) -> torch.Tensor:
         """Squared error of dreaming real states, summed over the dimensions."""
         return 0.5 * (self.head(feat) - self.norm(embed)).square().sum(-1).mean()
-
-
-def frozen(make: Callable[[], nn.Module]) -> nn.Module:
-    """A network that keeps its random initial weights; they are in its checkpoint and in no optimizer."""
-    return make().requires_grad_(False)

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.parts import DreamtEmbedding, RunningNorm, frozen
+from sb3_cpm.uncertainty.parts import DreamtEmbedding, RunningNorm
 from sb3_cpm.uncertainty.scale import ScaledUncertainty, root
 from sb3_cpm.world_model.networks import MLP
 
@@ -57,7 +57,8 @@ class RandomNetworkDistillation(ScaledUncertainty):
         self.dream = DreamtEmbedding(sizes.feat, sizes.embed, units) if inputs == "embed" else None
         self.norm = RunningNorm(size)
         self.output_norm = RunningNorm(output_dim)  # random features differ in size; standardised, all count alike
-        self.random = frozen(lambda: MLP(size, max(layers - 1, 1), units, output_dim))
+        # keeps its initial weights, which are in the checkpoint and in no optimizer
+        self.random = MLP(size, max(layers - 1, 1), units, output_dim).requires_grad_(False)
         self.trained = MLP(size, layers, units, output_dim)
 
     def raw(self, transitions: Transitions) -> torch.Tensor:

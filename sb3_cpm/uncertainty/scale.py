@@ -11,7 +11,7 @@ from abc import abstractmethod
 import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions, Uncertainty
-from sb3_cpm.world_model.linear import frozen
+from sb3_cpm.world_model.networks import frozen
 
 METRICS = ("exp", "log")
 MOST_ROWS = 256  # of a batch tell the scale as much as all of them

@@ -15,19 +15,19 @@ The actor learns in one of three ways (preset entry ``actor_gradient``; Hafner e
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import nn
 
-from sb3_cpm.world_model.acceleration import is_compiled, is_plain, mixed_precision
-from sb3_cpm.world_model.by_hand import Returns, through
+from sb3_cpm.presets import Preset
+from sb3_cpm.world_model.by_hand.dream import Dream, DreamSettings
+from sb3_cpm.world_model.by_hand.returns import Returns, through
 from sb3_cpm.world_model.distributions import GaussianLatent, TruncatedNormal
-from sb3_cpm.world_model.dream import Dream, Settings
-from sb3_cpm.world_model.linear import frozen
+from sb3_cpm.world_model.fast.acceleration import is_compiled, is_plain, mixed_precision
+from sb3_cpm.world_model.fast.one_hot import OneHot
 from sb3_cpm.world_model.losses import lambda_returns
-from sb3_cpm.world_model.networks import MLP
-from sb3_cpm.world_model.one_hot import OneHot
+from sb3_cpm.world_model.networks import MLP, frozen
 from sb3_cpm.world_model.optimizer import Gradients, Optimizer
 from sb3_cpm.world_model.rssm import RSSM, LatentState
 from sb3_cpm.world_model.world_model import WorldModel
@@ -98,30 +98,26 @@ class ActorCritic(nn.Module):
 
     updates: torch.Tensor
 
-    def __init__(
-        self, name: str, feat_dim: int, action_dim: int, preset: Mapping[str, Any], one_hot: OneHot | None = None
-    ) -> None:
+    def __init__(self, name: str, feat_dim: int, action_dim: int, preset: Preset, one_hot: OneHot | None = None) -> None:
         super().__init__()
         self.name, self.preset, self.one_hot = name, preset, one_hot
-        self.entropy_scale: float = preset["exploration_entropy_scale" if name == "exploration" else "entropy_scale"]
-        self.actor = Actor(feat_dim, action_dim, preset["actor_layers"], preset["actor_units"], one_hot)
+        self.entropy_scale = preset.exploration_entropy_scale if name == "exploration" else preset.entropy_scale
+        self.actor = Actor(feat_dim, action_dim, preset.actor_layers, preset.actor_units, one_hot)
         self.critic = self._make_critic(feat_dim)
         self.target_critic = self.critic
-        if preset["slow_target"]:
+        if preset.slow_target:
             self.target_critic = self._make_critic(feat_dim).requires_grad_(False)
             self.target_critic.load_state_dict(self.critic.state_dict())
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
 
     def _make_critic(self, feat_dim: int) -> MLP:
-        return MLP(feat_dim, self.preset["critic_layers"], self.preset["critic_units"], 1, self.one_hot)
+        return MLP(feat_dim, self.preset.critic_layers, self.preset.critic_units, 1, self.one_hot)
 
     def make_optimizers(self) -> dict[str, Optimizer]:
         """Optimizers of actor and critic, by name."""
-        common = {key: self.preset[name] for key, name in (("eps", "adam_eps"), ("clip", "grad_clip"))}
-        common["weight_decay"] = self.preset["weight_decay"]
-        parts = {"actor": (self.actor, "actor_lr"), "critic": (self.critic, "critic_lr")}
+        parts = {"actor": (self.actor, self.preset.actor_lr), "critic": (self.critic, self.preset.critic_lr)}
         return {
-            f"{self.name}_{part}": Optimizer(f"{self.name} {part}", [module], self.preset[rate], **common)
+            f"{self.name}_{part}": Optimizer(f"{self.name} {part}", [module], rate, **self.preset.optimizer_kwargs)
             for part, (module, rate) in parts.items()
         }
 
@@ -136,14 +132,14 @@ class ActorCritic(nn.Module):
         :param start: states to start in, batch dimension ``(n,)``, without gradient
         """
         if self._learns_by_hand(world_model, start):
-            settings = Settings(self.preset["horizon"], self.preset["actor_input_gradient"])
+            settings = DreamSettings(self.preset.horizon, self.preset.actor_input_gradient)
             layers = [layer for layer in self.actor.net if isinstance(layer, nn.Linear)]
             actor = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
             here, there, acts, outputs = Dream.apply(settings, world_model.rssm.dynamics(), start.deter, start.stoch, *actor)
             return Imagination(here, acts, TruncatedNormal.of_outputs(outputs).entropy(), there)
         states, feats, actions, policies = [start], [start.feat], [], []
-        for _ in range(self.preset["horizon"]):
-            seen = feats[-1] if self.preset["actor_input_gradient"] else feats[-1].detach()
+        for _ in range(self.preset.horizon):
+            seen = feats[-1] if self.preset.actor_input_gradient else feats[-1].detach()
             policies.append(self.actor(seen))
             actions.append(policies[-1].rsample())
             states.append(world_model.rssm.imagine_step(states[-1], actions[-1]))
@@ -159,8 +155,8 @@ class ActorCritic(nn.Module):
 
     def _learns_by_hand(self, world_model: WorldModel, start: LatentState) -> bool:
         """
-        Whether gradients are computed by hand (:mod:`~sb3_cpm.world_model.dream`, :mod:`~sb3_cpm.world_model.by_hand`): with
-        Gaussian latents, in plain float32 on a CPU. They are the same as autograd's.
+        Whether gradients are computed by hand (:mod:`~sb3_cpm.world_model.by_hand`): with Gaussian latents, in plain float32
+        on a CPU. They are the same as autograd's.
         """
         return (
             is_plain(start.deter)
@@ -186,14 +182,14 @@ class ActorCritic(nn.Module):
         :param optimizers: those of :meth:`make_optimizers`
         :param share: how much each start counts, 1 on average, shape ``(n,)``; None where all count alike
         """
-        amp, by_hand = mixed_precision(start.deter.device, self.preset["amp"]), self._learns_by_hand(world_model, start)
+        amp, by_hand = mixed_precision(start.deter.device, self.preset.amp), self._learns_by_hand(world_model, start)
         # what the actor learns goes through world model and slow critic, which learn nothing here; by hand nobody asks
         constant = () if by_hand else (world_model, self.target_critic)
-        with torch.set_grad_enabled(self.preset["actor_gradient"] != "reinforce"), frozen(*constant):
+        with torch.set_grad_enabled(self.preset.actor_gradient != "reinforce"), frozen(*constant):
             with amp:
                 imagined = self.imagine(world_model, start)
-            rewards = reward(imagined)
-            gamma, lambda_ = self.preset["gamma"], self.preset["lambda_"]
+            rewards = reward(imagined)  # (H, n), and so are returns, values and discounts: [i] of arriving in state i + 1
+            gamma, lambda_ = self.preset.gamma, self.preset.lambda_
             if by_hand:
                 heads = (self.target_critic, world_model.continue_head)
                 returns, values, discounts = Returns.apply(rewards, imagined.next_feats, *heads, gamma, lambda_)
@@ -203,9 +199,9 @@ class ActorCritic(nn.Module):
                     values = self.target_critic(imagined.next_feats).float().squeeze(-1)
                 returns = lambda_returns(rewards, values, discounts, lambda_)
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
-        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()
-        share = torch.ones_like(reached[0]) if share is None else share
-        weight = reached * share
+        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()  # (H, n)
+        share = torch.ones_like(reached[0]) if share is None else share  # (n,)
+        weight = reached * share  # (H, n)
 
         objective, entropies = self._objective(imagined, returns, values)
         actor_loss = -(weight * (objective + self.entropy_scale * entropies)).mean()
@@ -232,11 +228,11 @@ class ActorCritic(nn.Module):
         """
         feats = imagined.feats.detach()
         if by_hand:
-            judged = through(self.critic, feats)
+            judged = through(self.critic, feats)  # of H * n rows
             error = judged.output.view_as(returns) - returns
             loss = (weight * 0.5 * error.square()).mean()
             return loss, judged.to_parameters((weight * error / error.numel()).view(-1, 1))
-        with mixed_precision(feats.device, self.preset["amp"]):
+        with mixed_precision(feats.device, self.preset.amp):
             predicted = self.critic(feats).float().squeeze(-1)
         loss = (weight * 0.5 * (predicted - returns).square()).mean()
         return loss, optimizers[f"{self.name}_critic"].gradients(loss)
@@ -266,23 +262,23 @@ class ActorCritic(nn.Module):
         :param returns: of each action, shape ``(H, n)``
         :param values: of the states 1..H by the slow critic, shape ``(H, n)``
         """
-        kind = self.preset["actor_gradient"]
+        kind = self.preset.actor_gradient
         if kind == "dynamics":
             return returns, imagined.entropies
         feats = imagined.feats.detach()
-        with mixed_precision(feats.device, self.preset["amp"]):
+        with mixed_precision(feats.device, self.preset.amp):
             policy = self.actor(feats)
         with torch.no_grad():
-            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))
+            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))  # of states 0..H-1, (H, n)
             advantage = returns - baseline
         reinforce = policy.log_prob(imagined.actions.detach()) * advantage
         if kind == "reinforce":
             return reinforce, policy.entropy()
-        share = self.preset["reinforce_share"]
+        share = self.preset.reinforce_share
         return share * reinforce + (1.0 - share) * returns, imagined.entropies
 
     def _follow_slowly(self) -> None:
         """Hard copy of the critic into the slow target every ``slow_target_every`` updates."""
         self.updates += 1
-        if self.preset["slow_target"] and int(self.updates) % self.preset["slow_target_every"] == 0:
+        if self.preset.slow_target and int(self.updates) % self.preset.slow_target_every == 0:
             self.target_critic.load_state_dict(self.critic.state_dict())

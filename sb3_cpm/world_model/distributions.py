@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from sb3_cpm.world_model.one_hot import OneHot
+from sb3_cpm.world_model.fast.one_hot import OneHot
 
 SQRT_2PI = math.sqrt(2.0 * math.pi)
 SQRT_2 = math.sqrt(2.0)

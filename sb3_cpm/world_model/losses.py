@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import cache_slices
 from sb3_cpm.world_model.distributions import Latent
+from sb3_cpm.world_model.fast.acceleration import cache_slices
 
 
 def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:

@@ -5,17 +5,19 @@ Initial weights are torch's own. Glorot's, as in Dreamer's TensorFlow original, 
 slowly here: open-loop pixel error after 300 updates of a moving square 0.074 instead of 0.063.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import nn
 
-from sb3_cpm.world_model.activation import ELU
-from sb3_cpm.world_model.deconvolution import Deconvolution
-from sb3_cpm.world_model.linear import Linear
+from sb3_cpm.world_model.fast.activation import ELU
+from sb3_cpm.world_model.fast.deconvolution import Deconvolution
+from sb3_cpm.world_model.fast.linear import Linear
+from sb3_cpm.world_model.fast.one_hot import OneHot, OneHotLinear
 from sb3_cpm.world_model.observations import MIN_FEATURE_MAP, Inputs, ObservationSpec
-from sb3_cpm.world_model.one_hot import OneHot, OneHotLinear
 
 CACHED_NUMBERS = 2**21  # of a feature map that several operations find in the cache, 8 MB
 
@@ -256,3 +258,19 @@ class Decoder(nn.Module):
         return Inputs(
             images=None if self.cnn is None else self.cnn(feat), vectors=None if self.mlp is None else self.mlp(feat)
         )
+
+
+@contextmanager
+def frozen(*modules: nn.Module) -> Iterator[None]:
+    """
+    Context in which the weights of ``modules`` are constants: what is computed with them is differentiable with respect to its
+    inputs only, and nothing is computed for the weights.
+    """
+    parameters = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)

@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 
 from sb3_cpm.spaces import is_cloud, is_vector, looks_like_cloud
-from sb3_cpm.world_model.acceleration import cache_slices
+from sb3_cpm.world_model.fast.acceleration import cache_slices
 
 MIN_FEATURE_MAP = 2  # the smallest feature map of the CNN, pixels per side
 

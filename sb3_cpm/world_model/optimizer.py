@@ -1,5 +1,6 @@
 """Adam with what Dreamer adds to it: gradient clipping, decoupled weight decay, and a refusal to step on NaN."""
 
+import copy
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -37,6 +38,16 @@ class Optimizer:
         self.decayed: list[torch.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
         self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
 
+    @property
+    def learning_rate(self) -> float:
+        """Of all parameters."""
+        return self.adam.param_groups[0]["lr"]
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        for group in self.adam.param_groups:
+            group["lr"] = rate
+
     def gradients(self, loss: torch.Tensor) -> Gradients:
         """
         :param loss: scalar
@@ -72,6 +83,12 @@ class Optimizer:
             with torch.no_grad():
                 torch._foreach_mul_(self.decayed, 1.0 - self.weight_decay)
         return norm
+
+    def adopt(self, other: "Optimizer") -> None:
+        """Take over another one's averages of gradients; the learning rate stays this one's."""
+        rate = self.learning_rate
+        self.adam.load_state_dict(copy.deepcopy(other.adam.state_dict()))  # torch would share the averages
+        self.learning_rate = rate
 
     def state_dict(self) -> dict[str, Any]:
         return self.adam.state_dict()

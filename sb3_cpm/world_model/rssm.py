@@ -18,13 +18,13 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_cpm.world_model.acceleration import is_compiled
+from sb3_cpm.world_model.by_hand.dream import Dynamics
+from sb3_cpm.world_model.by_hand.scan import Scan, ScanSettings, Weights, rows_with_resets
 from sb3_cpm.world_model.distributions import GaussianLatent, Latent
-from sb3_cpm.world_model.dream import Dynamics
-from sb3_cpm.world_model.linear import Linear
+from sb3_cpm.world_model.fast.acceleration import is_compiled
+from sb3_cpm.world_model.fast.linear import Linear
+from sb3_cpm.world_model.fast.one_hot import OneHotLinear
 from sb3_cpm.world_model.networks import MLP, GRUCell
-from sb3_cpm.world_model.one_hot import OneHotLinear
-from sb3_cpm.world_model.scan import Scan, Settings, Weights, rows_with_resets
 
 
 class LatentState(NamedTuple):
@@ -163,7 +163,7 @@ class RSSM(nn.Module):
         What :meth:`observe` computes step by step, with the gradient by hand; in float32 also in mixed precision, since the
         products are too small for bfloat16 to pay.
         """
-        settings = Settings(self.latent, self.gru.update_bias, self.gru.norm.eps)
+        settings = ScanSettings(self.latent, self.gru.update_bias, self.gru.norm.eps)
         weights = Weights(
             self.input_stoch.weight,
             self.gru.gates.weight,
@@ -197,7 +197,7 @@ class RSSM(nn.Module):
         return LatentState(deter, self.latent.sample(stats, self.latent.noise(len(deter), like=deter)), stats)
 
     def dynamics(self) -> Dynamics:
-        """What :meth:`imagine_step` is made of, for :class:`~sb3_cpm.world_model.dream.Dream`."""
+        """What :meth:`imagine_step` is made of, for :class:`~sb3_cpm.world_model.by_hand.dream.Dream`."""
         assert isinstance(self.latent, GaussianLatent)
         gates, hidden = self.gru.gates.weight, self.input_action.out_features
         hidden_layer, _, output_layer = self.prior_net

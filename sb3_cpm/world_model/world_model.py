@@ -2,13 +2,14 @@
 The world model: encoder, RSSM, decoders, reward head and continue head, trained together (report, B.1; Hafner et al. 2021).
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_cpm.presets import Preset
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent, Latent
 from sb3_cpm.world_model.losses import balanced_kl, masked_mean, squared_error
 from sb3_cpm.world_model.networks import MLP, Decoder, Encoder
@@ -78,13 +79,11 @@ class WorldModelOutput(NamedTuple):
         return torch.stack(list(self.losses.values())).sum()
 
 
-def make_latent(preset: Mapping[str, Any]) -> Latent:
+def make_latent(preset: Preset) -> Latent:
     """The kind of stochastic state that a preset asks for."""
-    if preset["latent"] == "gaussian":
-        return GaussianLatent(preset["stoch_size"])
-    if preset["latent"] == "categorical":
-        return CategoricalLatent(preset["stoch_size"], preset["stoch_classes"])
-    raise ValueError(f"`latent` must be 'gaussian' or 'categorical', got {preset['latent']!r}.")
+    if preset.latent == "gaussian":
+        return GaussianLatent(preset.stoch_size)
+    return CategoricalLatent(preset.stoch_size, preset.stoch_classes)
 
 
 class WorldModel(nn.Module):
@@ -94,22 +93,22 @@ class WorldModel(nn.Module):
     :param preset: sizes and scales, see :mod:`sb3_cpm.presets`
     """
 
-    def __init__(self, spec: ObservationSpec, action_dim: int, preset: Mapping[str, Any]) -> None:
+    def __init__(self, spec: ObservationSpec, action_dim: int, preset: Preset) -> None:
         super().__init__()
-        self.spec, self.preset = spec, preset
+        self.spec, self.action_dim, self.preset = spec, action_dim, preset
         #: what the reconstruction error of each key is called in the log
         self.error_names = {key: f"error_{name}" for key, name in short_names(spec.keys).items()}
-        vector = (preset["vector_layers"], preset["vector_units"])
-        cnn = (preset["cnn_depth"], preset["cnn_layers"])
+        vector = (preset.vector_layers, preset.vector_units)
+        cnn = (preset.cnn_depth, preset.cnn_layers)
         self.encoder = Encoder(spec, *cnn, *vector)
         self.embed_dim = self.encoder.output_dim
         self.latent = make_latent(preset)
-        self.rssm = RSSM(self.latent, preset["deter_size"], preset["hidden_size"], self.embed_dim, action_dim)
+        self.rssm = RSSM(self.latent, preset.deter_size, preset.hidden_size, self.embed_dim, action_dim)
         self.feat_dim = self.rssm.feat_dim
         self.decoder = Decoder(self.feat_dim, spec, *cnn, *vector, self.latent.one_hot)
-        head = (self.feat_dim, preset["head_layers"], preset["head_units"], 1, self.latent.one_hot)
+        head = (self.feat_dim, preset.head_layers, preset.head_units, 1, self.latent.one_hot)
         self.reward_head = MLP(*head)
-        self.continue_head = MLP(*head) if preset["continue_head"] else None
+        self.continue_head = MLP(*head) if preset.continue_head else None
 
     def loss(self, batch: Sequences) -> WorldModelOutput:
         """Everything that one update of the world model minimises, and the posterior states it found on the way."""
@@ -120,9 +119,9 @@ class WorldModel(nn.Module):
         prior = self.rssm.prior(posterior.deter)
         feat = posterior.feat
         kl_loss, kl = balanced_kl(
-            self.latent, posterior.stats, prior, batch.mask, self.preset["kl_balance"], self.preset["free_nats"]
+            self.latent, posterior.stats, prior, batch.mask, self.preset.kl_balance, self.preset.free_nats
         )
-        losses = {"kl": self.preset["kl_scale"] * kl_loss}
+        losses = {"kl": self.preset.kl_scale * kl_loss}
         metrics = {"kl": kl}
         reconstructions, errors = self._reconstruction_losses(feat, batch)
         losses.update(reconstructions)
@@ -151,18 +150,18 @@ class WorldModel(nn.Module):
         return losses, metrics
 
     def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        feat_reward = feat if self.preset["reward_gradient"] else feat.detach()
-        target = symlog(batch.rewards) if self.preset["symlog_rewards"] else batch.rewards
+        feat_reward = feat if self.preset.reward_gradient else feat.detach()
+        target = symlog(batch.rewards) if self.preset.symlog_rewards else batch.rewards
         prediction = self.reward_head(feat_reward).float().squeeze(-1)
         error = squared_error(prediction.flatten(), target.flatten())
         # nothing was received for arriving in a reset state; its stored 0 is no observation of the reward function
         arrived = (batch.mask & ~batch.is_first).flatten()
-        losses = {"reward": self.preset["reward_scale"] * masked_mean(error, arrived)}
+        losses = {"reward": self.preset.reward_scale * masked_mean(error, arrived)}
         if self.continue_head is not None:
             logits = self.continue_head(feat).float().squeeze(-1)
             goes_on = (~batch.is_terminal).to(logits.dtype)
             entropy = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="none")
-            losses["continue"] = self.preset["continue_scale"] * masked_mean(entropy, batch.mask)
+            losses["continue"] = self.preset.continue_scale * masked_mean(entropy, batch.mask)
         with torch.no_grad():  # the report's measures of Fig. 10f; without any reward the relative one is 0
             rewards = batch.rewards.flatten()
             absolute = masked_mean((self._unsquashed(prediction).flatten() - rewards).abs(), arrived)
@@ -176,7 +175,7 @@ class WorldModel(nn.Module):
 
     def _unsquashed(self, prediction: torch.Tensor) -> torch.Tensor:
         """What the reward head says, on the scale of the environment."""
-        return symexp(prediction) if self.preset["symlog_rewards"] else prediction
+        return symexp(prediction) if self.preset.symlog_rewards else prediction
 
     def continue_probability(self, feat: torch.Tensor) -> torch.Tensor:
         """Predicted probability that the episode does not terminate in a state, shape ``(*batch,)``."""

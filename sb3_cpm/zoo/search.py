@@ -11,6 +11,7 @@ import contextvars
 import copy
 import io
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from sb3_cpm.agents.algorithms import evaluated
@@ -229,7 +230,7 @@ def _sample_dreamer(trial: Any, n_actions: int, n_envs: int, additional_args: di
     if isinstance(preset, str):
         from sb3_cpm.presets import make_preset
 
-        preset = make_preset(preset)
+        preset = asdict(make_preset(preset))
     return {**converted, "preset": {**(preset or {}), **converted["preset"]}}
 
 

@@ -1,5 +1,5 @@
 """
-Dense layers that are as fast as the processor allows, and weights that are left alone for a while.
+Dense layers that are as fast as the processor allows.
 
 On CPUs PyTorch multiplies float32 matrices with MKL, which on AMD's processors reaches half of the speed of oneDNN, which
 PyTorch brings along for convolutions (measured: 100 and 210 GFLOP/s on one core of an EPYC with AVX-512). On Intel's it is
@@ -11,8 +11,6 @@ small matrices), everything is PyTorch's own.
 """
 
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -20,7 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import is_amd, is_plain
+from sb3_cpm.world_model.fast.acceleration import is_amd, is_plain
 
 MIN_ROWS, MIN_MULTIPLICATIONS = 64, 2**22  # below, calling costs more than multiplying
 
@@ -140,19 +138,3 @@ class _Product(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             to_bias = gradient.sum(0)
         return to_inputs, to_weight, to_bias
-
-
-@contextmanager
-def frozen(*modules: nn.Module) -> Iterator[None]:
-    """
-    Context in which the weights of ``modules`` are constants: what is computed with them is differentiable with respect to its
-    inputs only, and nothing is computed for the weights.
-    """
-    parameters = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
-    for parameter in parameters:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in parameters:
-            parameter.requires_grad_(True)

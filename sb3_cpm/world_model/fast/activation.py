@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import is_amd, is_plain
+from sb3_cpm.world_model.fast.acceleration import is_amd, is_plain
 
 SLICE = 2**16  # numbers that several operations find in the cache; with fewer in all, calling costs more
 

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.acceleration import is_plain
+from sb3_cpm.world_model.fast.acceleration import is_plain
 
 MAX_CHANNELS = 16  # of an output that is drawn
 #: Taps of the kernel that read the input pixel before and at (even rows or columns), at and behind (odd ones).

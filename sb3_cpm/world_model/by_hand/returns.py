@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.activation import elu_, elu_gradient_
-from sb3_cpm.world_model.linear import linear, weight_gradient
+from sb3_cpm.world_model.fast.activation import elu_, elu_gradient_
+from sb3_cpm.world_model.fast.linear import linear, weight_gradient
 from sb3_cpm.world_model.networks import MLP
 
 
@@ -86,15 +86,15 @@ class Returns(torch.autograd.Function):
         gamma: float,
         lambda_: float,
     ) -> tuple[torch.Tensor, ...]:
-        valued = through(critic, feats)
-        values = valued.output.view_as(rewards)
+        valued = through(critic, feats)  # of H * n rows
+        values = valued.output.view_as(rewards)  # (H, n): values[i] is that of state i + 1, in which action i arrives
         ends = None if continue_head is None else through(continue_head, feats)
         goes_on = torch.ones_like(rewards) if ends is None else ends.output.view_as(rewards).sigmoid()
         discounts = gamma * goes_on
         returns = torch.empty_like(rewards)
         inputs = torch.addcmul(rewards, discounts, values, value=1.0 - lambda_).unbind(0)
         decays = (lambda_ * discounts).unbind(0)
-        following = values[-1]
+        following = values[-1]  # (n,): after the last step the critic has the word
         for i in reversed(range(len(rewards))):
             following = torch.addcmul(inputs[i], decays[i], following, out=returns[i])
         ctx.mark_non_differentiable(values, discounts)
@@ -112,11 +112,11 @@ class Returns(torch.autograd.Function):
         rows = to_rewards.unbind(0)
         for i in range(1, len(rows)):
             rows[i].addcmul_(rows[i - 1], ctx.decays[i - 1])
-        to_values = to_rewards * discounts * (1.0 - ctx.lambda_)
+        to_values = to_rewards * discounts * (1.0 - ctx.lambda_)  # (H, n)
         to_values[-1].addcmul_(rows[-1], ctx.decays[-1])
         to_feats = valued.to_inputs(to_values.view(-1, 1))
         if ends is not None:
-            following = torch.cat((returns[1:], values[-1:]))
+            following = torch.cat((returns[1:], values[-1:]))  # (H, n): the return after each step
             to_logits = to_rewards * torch.lerp(values, following, ctx.lambda_) * discounts * (1.0 - goes_on)
             to_feats += ends.to_inputs(to_logits.view(-1, 1))
         return to_rewards, to_feats.view(*values.shape, -1), None, None, None, None

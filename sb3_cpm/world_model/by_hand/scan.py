@@ -19,23 +19,23 @@ import torch
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.activation import tanh_
 from sb3_cpm.world_model.distributions import Latent
+from sb3_cpm.world_model.fast.activation import tanh_
 
 
 class Weights(NamedTuple):
-    """Of all layers, as ``torch.nn.Linear`` and ``LayerNorm`` hold them."""
+    """Of all layers, as ``torch.nn.Linear`` and ``LayerNorm`` hold them. Sizes are those of what is read and given."""
 
-    stoch: torch.Tensor
-    gates: torch.Tensor
-    norm: torch.Tensor
-    norm_bias: torch.Tensor
-    deter: torch.Tensor
-    out: torch.Tensor
-    out_bias: torch.Tensor
+    stoch: torch.Tensor  # (hidden, stoch)
+    gates: torch.Tensor  # (3 * deter, hidden + deter): reset, candidate and update, of a and h
+    norm: torch.Tensor  # (3 * deter,)
+    norm_bias: torch.Tensor  # (3 * deter,)
+    deter: torch.Tensor  # (hidden, deter)
+    out: torch.Tensor  # (stats, hidden)
+    out_bias: torch.Tensor  # (stats,)
 
 
-class Settings(NamedTuple):
+class ScanSettings(NamedTuple):
     """
     What has no gradient.
 
@@ -61,7 +61,7 @@ class Scan(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        settings: Settings,
+        settings: ScanSettings,
         noise: torch.Tensor,
         is_first: torch.Tensor,
         deter: torch.Tensor,
@@ -73,9 +73,9 @@ class Scan(torch.autograd.Function):
         layers, latent = Weights(*weights), settings.latent
         hidden, size = actions_in.shape[-1], deter.shape[-1]
         resets, first = rows_with_resets(is_first), is_first.unbind(0)
-        inputs = actions_in.new_empty(*actions_in.shape[:2], hidden + size)  # of the gates: a and h, side by side
-        inner, memory = (part.unbind(0) for part in inputs.split((hidden, size), dim=-1))
-        posteriors = torch.empty_like(embed_in)
+        inputs = actions_in.new_empty(*actions_in.shape[:2], hidden + size)  # (L, n, hidden + deter): a and h, side by side
+        inner, memory = (part.unbind(0) for part in inputs.split((hidden, size), dim=-1))  # L views: (n, hidden), (n, deter)
+        posteriors = torch.empty_like(embed_in)  # (L, n, hidden)
         # taking a row of a tensor, or a transpose, costs as much as a small operation: each is taken once
         rows = [part.unbind(0) for part in (actions_in, embed_in, inputs, posteriors, noise)]
         from_stoch, to_gates, from_deter, to_stats = (
@@ -87,19 +87,20 @@ class Scan(torch.autograd.Function):
         for t, (action_in, embedding, both, posterior, chance) in enumerate(zip(*rows, strict=True)):
             if resets[t]:
                 deter, stoch = deter.masked_fill(first[t], 0.0), stoch.masked_fill(first[t], 0.0)
-            before = stoch
-            F.elu_(torch.addmm(action_in, stoch, from_stoch, out=inner[t]))
-            memory[t].copy_(deter)
-            products = both @ to_gates
+            before = stoch  # (n, stoch)
+            F.elu_(torch.addmm(action_in, stoch, from_stoch, out=inner[t]))  # a: (n, hidden)
+            memory[t].copy_(deter)  # h: (n, deter)
+            products = both @ to_gates  # (n, 3 * deter)
             gates, mean, spread = torch.native_layer_norm(products, (3 * size,), layers.norm, norm_bias, settings.norm_eps)
-            opened = torch.sigmoid(gates)  # reset and update; what becomes of the candidate in between is not looked at
-            bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])
-            deter = torch.lerp(deter, bounded, opened[:, 2 * size :])
-            F.elu_(torch.addmm(embedding, deter, from_deter, out=posterior))
-            stats = torch.addmm(layers.out_bias, posterior, to_stats)
-            stoch = latent.sample(stats, chance)
+            # (n, 3 * deter): reset and update; what becomes of the candidate in between is not looked at
+            opened = torch.sigmoid(gates)
+            bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])  # (n, deter)
+            deter = torch.lerp(deter, bounded, opened[:, 2 * size :])  # h': (n, deter)
+            F.elu_(torch.addmm(embedding, deter, from_deter, out=posterior))  # p: (n, hidden)
+            stats = torch.addmm(layers.out_bias, posterior, to_stats)  # (n, stats)
+            stoch = latent.sample(stats, chance)  # (n, stoch)
             kept.append((deter, stoch, stats, before, products, mean, spread, gates, opened, bounded))
-        deters, stochs, all_stats, *rest = (torch.stack(part) for part in zip(*kept, strict=True))
+        deters, stochs, all_stats, *rest = (torch.stack(part) for part in zip(*kept, strict=True))  # (L, n, ...) each
         ctx.settings, ctx.resets = settings, resets
         ctx.save_for_backward(noise, is_first, deters, all_stats, inputs, posteriors, *rest, *weights)
         return deters, stochs, all_stats
@@ -114,8 +115,9 @@ class Scan(torch.autograd.Function):
         layers, latent = Weights(*weights), ctx.settings.latent
         size = deters.shape[-1]
         hidden = inputs.shape[-1] - size
-        passed = opened[..., :size], gates[..., size : 2 * size], bounded, opened[..., 2 * size :]
-        slopes_of_gates, remembered = gate_slopes(*passed, inputs[..., hidden:])
+        passed = opened[..., :size], gates[..., size : 2 * size], bounded, opened[..., 2 * size :]  # (L, n, deter) each
+        slopes_of_gates, remembered = gate_slopes(*passed, inputs[..., hidden:])  # (L, n, 3, deter), (L, n, deter)
+        # ELU's slope from its result y: 1 above zero, exp(x) = y + 1 below; (L, n, hidden)
         elu_a, elu_p = inputs[..., :hidden].clamp(max=0.0) + 1.0, posteriors.clamp(max=0.0) + 1.0
         slopes_of_stats = latent.slopes(all_stats, noise)
         norm = (layers.norm, layers.norm_bias)
@@ -129,20 +131,22 @@ class Scan(torch.autograd.Function):
         to_stats, to_posteriors, to_gates, to_products, to_a = (part.unbind(0) for part in found)
         first, elus, keeps = is_first.unbind(0), elu_a.unbind(0), remembered.unbind(0)
 
+        # of h' and z, as far as the steps after t made them: (n, deter), (n, stoch)
         g_deter, g_stoch = torch.zeros_like(deters[0]), torch.zeros_like(of_stochs[0])
         for t, (of_deter, of_stoch, of_stat, slope, elu, slope_of_gates, product, average, deviation) in reversed(
             list(enumerate(zip(*rows, strict=True)))
         ):
-            g_stats = torch.add(of_stat, latent.pull_back(slope, of_stoch + g_stoch), out=to_stats[t])
-            g_posterior = torch.mm(g_stats, layers.out, out=to_posteriors[t]).mul_(elu)
-            g_deter = torch.addmm(of_deter + g_deter, g_posterior, layers.deter)
+            g_stats = torch.add(of_stat, latent.pull_back(slope, of_stoch + g_stoch), out=to_stats[t])  # (n, stats)
+            g_posterior = torch.mm(g_stats, layers.out, out=to_posteriors[t]).mul_(elu)  # (n, hidden)
+            g_deter = torch.addmm(of_deter + g_deter, g_posterior, layers.deter)  # (n, deter)
+            # (n, 3, deter) * (n, 1, deter)
             torch.mul(slope_of_gates, g_deter.unsqueeze(1), out=to_gates[t].unflatten(-1, (3, size)))
             g_products = norm_backward(to_gates[t], product, average, deviation, *norm, (True, False, False))[0]
-            to_products[t].copy_(g_products)
-            g_inner, g_memory = (g_products @ layers.gates).split((hidden, size), dim=-1)
-            g_a = torch.mul(g_inner, elus[t], out=to_a[t])
-            g_deter = g_memory.addcmul_(g_deter, keeps[t])
-            g_stoch = g_a @ layers.stoch
+            to_products[t].copy_(g_products)  # (n, 3 * deter)
+            g_inner, g_memory = (g_products @ layers.gates).split((hidden, size), dim=-1)  # (n, hidden), (n, deter)
+            g_a = torch.mul(g_inner, elus[t], out=to_a[t])  # (n, hidden)
+            g_deter = g_memory.addcmul_(g_deter, keeps[t])  # of h, which is step t - 1's h': (n, deter)
+            g_stoch = g_a @ layers.stoch  # (n, stoch)
             if ctx.resets[t]:
                 g_deter.masked_fill_(first[t], 0.0)
                 g_stoch.masked_fill_(first[t], 0.0)

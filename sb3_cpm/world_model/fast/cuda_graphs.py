@@ -132,3 +132,25 @@ class Graphed:
             with no_garbage_collection(), torch.cuda.graph(graph, pool=self.pool.handle, stream=stream):
                 outputs = self.function(*fixed)
         return Recording(graph, fixed, outputs)
+
+
+class GraphedFunctions:
+    """
+    The functions of one challenger by name, each recorded on its own, in memory that they share.
+
+    :param device: of all their tensors
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.pool = GraphPool(device)
+        self.functions: dict[str, Graphed] = {}
+
+    def run(self, name: str, function: Callable[..., Any], *inputs: torch.Tensor | None) -> Any:
+        """
+        :param name: of the function, also in the warning of one that cannot be recorded
+        :param function: see :class:`Graphed`; of a name only the first is ever called
+        :param inputs: its arguments
+        """
+        if name not in self.functions:
+            self.functions[name] = Graphed(name, function, self.pool)
+        return self.functions[name](*inputs)

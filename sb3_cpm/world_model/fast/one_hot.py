@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.linear import Linear, is_large, multiply
+from sb3_cpm.world_model.fast.linear import Linear, is_large, multiply
 
 MIN_ROWS = 256  # below, finding out what was chosen costs more than it saves
 WIDTH = 128  # columns of a matrix at a time, so few that all its rows stay in the cache while they are picked

@@ -1,6 +1,6 @@
 """
 Two switches for speed, both off by default: mixed precision (preset entry ``amp``) and ``compile``, which is ``torch.compile``
-on CPUs and stands for CUDA graphs on GPUs (:mod:`sb3_cpm.world_model.cuda_graphs`).
+on CPUs and stands for CUDA graphs on GPUs (:mod:`sb3_cpm.world_model.fast.cuda_graphs`).
 
 Mixed precision runs the matrix products and convolutions of training in bfloat16, whose range is float32's, so that no loss
 has to be scaled. Everything that adds up small differences stays in float32: weights and optimizers, recurrent and stochastic

@@ -1,4 +1,7 @@
-"""One file per challenger: whole or not written, checked before it is read, and read without executing anything in it."""
+"""
+What a saved challenger looks like: one file, whole or not written, checked before it is read, and read without executing
+anything in it.
+"""
 
 import io
 import os
@@ -8,9 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from gymnasium import spaces
 
 from sb3_cpm.files import DamagedFileError, first_not_finite, verify, write_sealed
+from sb3_cpm.world_model.observations import ObservationSpec
 
 FILE_FORMAT = "sb3_cpm challenger"
 #: 2: with a digest. 1, which is read as well, had none.
@@ -109,3 +115,58 @@ def check_sizes(name: str, own: Mapping[str, Any], other: Mapping[str, Any]) -> 
     for key in other:
         if key not in own:
             raise ValueError(f"The saved challenger has an additional weight {name}.{key}: it was built with another preset.")
+
+
+def describe_observations(spec: ObservationSpec) -> dict[str, dict[str, Any]]:
+    """:return: what is read of the observations, by key, as plain data: files are read without executing anything in them"""
+    keys: dict[str, dict[str, Any]] = {
+        key: {"shape": list(spec.shapes[key]), "image": key in spec.image_keys} for key in spec.keys
+    }
+    for key, limits in spec.ranges.items():
+        if not spec.is_full_uint8(key):  # what is not written is uint8 from 0 to 255
+            keys[key].update(range=list(limits), dtype=spec.dtypes[key])
+    return keys
+
+
+def same_observations(theirs: Mapping[str, Mapping[str, Any]], ours: Mapping[str, Mapping[str, Any]]) -> bool:
+    """
+    Whether two configurations read the same keys in the same way. Of dtypes only uint8 matters, everything else is read as
+    float32: files from before the dtype was written, where it was none, fit as well.
+    """
+
+    def comparable(keys: Mapping[str, Mapping[str, Any]]) -> list[tuple[Any, ...]]:
+        return [
+            (
+                key,
+                tuple(entry["shape"]),
+                entry["image"],
+                entry.get("dtype") == "uint8",
+                tuple(float(np.float32(limit)) for limit in entry.get("range", ())),
+            )
+            for key, entry in keys.items()
+        ]
+
+    return comparable(theirs) == comparable(ours)
+
+
+def space_of(entry: Mapping[str, Any]) -> spaces.Box:
+    """:return: the space of one key of :func:`describe_observations`"""
+    if "range" in entry:
+        low, high = entry["range"]
+        return spaces.Box(low, high, tuple(entry["shape"]), np.dtype(entry.get("dtype", "float32")).type)
+    if entry["image"]:
+        return spaces.Box(0, 255, tuple(entry["shape"]), np.uint8)
+    return spaces.Box(-np.inf, np.inf, tuple(entry["shape"]), np.float32)
+
+
+def random_state() -> dict[str, Any]:
+    """:return: state of torch's global random generators"""
+    cuda = [rng.cpu() for rng in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else []
+    return {"cpu": torch.get_rng_state(), "cuda": cuda}
+
+
+def restore_random_state(state: Mapping[str, Any]) -> None:
+    """:param state: of :func:`random_state`; that of GPUs counts where there are as many of them"""
+    torch.set_rng_state(state["cpu"].cpu())
+    if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda"]])

@@ -21,9 +21,9 @@ import torch
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
-from sb3_cpm.world_model.activation import tanh_
+from sb3_cpm.world_model.by_hand.scan import gate_slopes, norm_backward, rows_weight_gradient
 from sb3_cpm.world_model.distributions import GaussianLatent, OutputSampler, TruncatedNormal
-from sb3_cpm.world_model.scan import gate_slopes, norm_backward, rows_weight_gradient
+from sb3_cpm.world_model.fast.activation import tanh_
 
 
 class Dynamics(NamedTuple):
@@ -52,7 +52,7 @@ class Dynamics(NamedTuple):
     prior: tuple[tuple[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
-class Settings(NamedTuple):
+class DreamSettings(NamedTuple):
     """
     :param horizon: imagined steps, H
     :param through_input: whether the actor's input has a gradient
@@ -73,7 +73,7 @@ class Dream(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, settings: Settings, dynamics: Dynamics, deter: torch.Tensor, stoch: torch.Tensor, *actor: torch.Tensor
+        ctx: Any, settings: DreamSettings, dynamics: Dynamics, deter: torch.Tensor, stoch: torch.Tensor, *actor: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
         weights, biases = actor[::2], actor[1::2]
         horizon, n, latent = settings.horizon, len(deter), dynamics.latent
@@ -81,13 +81,13 @@ class Dream(torch.autograd.Function):
         # one row per state: (action, stoch, deter, x); what a layer reads lies side by side, and nothing is copied together
         rows = deter.new_empty(horizon + 1, n, dim + latent.size + size + hidden)
         parts = rows.split((dim, latent.size, size, hidden), dim=-1)
-        actions, stochs, deters, inner = (part.unbind(0) for part in parts)
-        feats = rows[..., dim : dim + latent.size + size]
+        actions, stochs, deters, inner = (part.unbind(0) for part in parts)  # H + 1 views each, of shape (n, size of the part)
+        feats = rows[..., dim : dim + latent.size + size]  # (H + 1, n, stoch + deter), what the actor reads
         stochs[0].copy_(stoch)
         deters[0].copy_(deter)
         # taking a row of a tensor, or a transpose, costs as much as a small operation: each is taken once
-        seen_rows, to_inner = feats.unbind(0), rows[..., : dim + latent.size].unbind(0)
-        to_gates = rows[..., dim + latent.size :].unbind(0)
+        seen_rows, to_inner = feats.unbind(0), rows[..., : dim + latent.size].unbind(0)  # to x: (n, action + stoch)
+        to_gates = rows[..., dim + latent.size :].unbind(0)  # (n, deter + hidden)
         values = [deter.new_empty(horizon, n, len(weight)) for weight in weights]  # of the actor's layers, its outputs last
         layers = [(bias, weight.t(), value.unbind(0)) for weight, bias, value in zip(weights, biases, values, strict=True)]
         inputs, gates_weight = dynamics.inputs.t(), dynamics.gates.t()
@@ -97,26 +97,26 @@ class Dream(torch.autograd.Function):
         sampler = OutputSampler(values[-1])
         kept: list[tuple[torch.Tensor, ...]] = []  # of every step, for the way back
         for t in range(horizon):
-            seen = seen_rows[t]
+            seen = seen_rows[t]  # (n, stoch + deter)
             for bias, weight, value in layers[:-1]:
-                seen = F.elu_(torch.addmm(bias, seen, weight, out=value[t]))
+                seen = F.elu_(torch.addmm(bias, seen, weight, out=value[t]))  # (n, units)
             bias, weight, outputs = layers[-1]
             chance = torch.rand_like(actions[t])
             action, standard = sampler.sample(torch.addmm(bias, seen, weight, out=outputs[t]), chance)
-            actions[t].copy_(action)
-            F.elu_(torch.addmm(dynamics.inputs_bias, to_inner[t], inputs, out=inner[t]))
-            products = torch.mm(to_gates[t], gates_weight)
+            actions[t].copy_(action)  # a: (n, action)
+            F.elu_(torch.addmm(dynamics.inputs_bias, to_inner[t], inputs, out=inner[t]))  # x: (n, hidden)
+            products = torch.mm(to_gates[t], gates_weight)  # (n, 3 * deter)
             gates, mean, spread = torch.native_layer_norm(products, (3 * size,), dynamics.norm, norm_bias, dynamics.norm_eps)
             opened = torch.sigmoid(gates)  # reset and update; what becomes of the candidate in between is not looked at
-            bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])
-            torch.lerp(deters[t], bounded, opened[:, 2 * size :], out=deters[t + 1])
-            prior = F.elu_(torch.addmm(prior_bias, deters[t + 1], to_prior))
-            stats = torch.addmm(stats_bias, prior, to_stats)
+            bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])  # (n, deter)
+            torch.lerp(deters[t], bounded, opened[:, 2 * size :], out=deters[t + 1])  # h': (n, deter)
+            prior = F.elu_(torch.addmm(prior_bias, deters[t + 1], to_prior))  # p: (n, hidden)
+            stats = torch.addmm(stats_bias, prior, to_stats)  # (n, stats)
             noise = latent.noise(n, like=stats)
-            latent.sample(stats, noise, out=stochs[t + 1])
+            latent.sample(stats, noise, out=stochs[t + 1])  # z': (n, stoch)
             kept.append((chance, standard, products, mean, spread, gates, opened, bounded, prior, stats, noise))
         ctx.settings, ctx.dynamics, ctx.dim = settings, dynamics, dim
-        here, there = feats[:-1].contiguous(), feats[1:].contiguous()
+        here, there = feats[:-1].contiguous(), feats[1:].contiguous()  # states 0..H-1 and 1..H
         if any(ctx.needs_input_grad):
             ctx.kept = kept
             ctx.save_for_backward(rows, here, *values, *weights)
@@ -132,19 +132,20 @@ class Dream(torch.autograd.Function):
         values, weights = rest[: len(rest) // 2], rest[len(rest) // 2 :]
         latent, horizon = dynamics.latent, settings.horizon
         hidden, size = len(dynamics.inputs), here.shape[-1] - latent.size
-        chance, standard, *_ = stacked = [torch.stack(part) for part in zip(*ctx.kept, strict=True)]
+        chance, standard, *_ = stacked = [torch.stack(part) for part in zip(*ctx.kept, strict=True)]  # (H, n, ...) each
         gates, opened, bounded, prior, stats, noise = stacked[5:]
         products, mean, spread = (part.unbind(0) for part in stacked[2:5])
-        before = rows[:-1, :, dim + latent.size : dim + latent.size + size]
+        before = rows[:-1, :, dim + latent.size : dim + latent.size + size]  # h: (H, n, deter)
         passed = opened[..., :size], gates[..., size : 2 * size], bounded, opened[..., 2 * size :]
-        slopes_of_gates, remembered = (part.unbind(0) for part in gate_slopes(*passed, before))
+        slopes_of_gates, remembered = (part.unbind(0) for part in gate_slopes(*passed, before))  # (n, 3, deter), (n, deter)
         slopes_of_stats = latent.slopes(stats, noise).unbind(0)
         slopes_of_outputs = TruncatedNormal.of_outputs(values[-1]).slopes(chance, standard).unbind(0)
         hidden_layers = (rows[:-1, :, -hidden:], prior, *values[:-1])
+        # ELU's slope from its result y: 1 above zero, exp(x) = y + 1 below
         elu_inner, elu_prior, *elu_values = (one.clamp(max=0.0).add_(1.0).unbind(0) for one in hidden_layers)
 
         # what comes from outside to the states 1..H: as those in which an action arrives, and in which the next is taken
-        outside = of_there.clone()
+        outside = of_there.clone()  # row i is state i + 1's
         outside[:-1] += of_here[1:]
         from_outside, from_outputs, from_actions = outside.unbind(0), of_outputs.unbind(0), of_actions.unbind(0)
         to_values = [torch.empty_like(one) for one in values]
@@ -152,23 +153,23 @@ class Dream(torch.autograd.Function):
         back = list(zip(reversed(weights[1:]), reversed(to_hidden), reversed(elu_values), strict=True))
         (to_prior, _), (to_stats, _) = dynamics.prior
         norm = (dynamics.norm, dynamics.norm_bias, (True, False, False))
-        g_stoch, g_deter = outside[-1].split((latent.size, size), dim=-1)
-        for t in reversed(range(horizon)):
-            g_stats = latent.pull_back(slopes_of_stats[t], g_stoch)
-            g_prior = (g_stats @ to_stats).mul_(elu_prior[t])
-            g_deter = torch.addmm(g_deter, g_prior, to_prior)
-            g_gates = (slopes_of_gates[t] * g_deter.unsqueeze(1)).flatten(1)
+        g_stoch, g_deter = outside[-1].split((latent.size, size), dim=-1)  # of state H
+        for t in reversed(range(horizon)):  # g_stoch and g_deter are those of state t + 1
+            g_stats = latent.pull_back(slopes_of_stats[t], g_stoch)  # (n, stats)
+            g_prior = (g_stats @ to_stats).mul_(elu_prior[t])  # (n, hidden)
+            g_deter = torch.addmm(g_deter, g_prior, to_prior)  # (n, deter)
+            g_gates = (slopes_of_gates[t] * g_deter.unsqueeze(1)).flatten(1)  # (n, 3, deter) -> (n, 3 * deter)
             g_products = norm_backward(g_gates, products[t], mean[t], spread[t], *norm)[0]
-            g_memory, g_inner = (g_products @ dynamics.gates).split((size, hidden), dim=-1)
-            g_action, g_sampled = ((g_inner * elu_inner[t]) @ dynamics.inputs).split((dim, latent.size), dim=-1)
-            g_action = g_action + from_actions[t]
+            g_memory, g_inner = (g_products @ dynamics.gates).split((size, hidden), dim=-1)  # of h and x
+            g_action, g_sampled = ((g_inner * elu_inner[t]) @ dynamics.inputs).split((dim, latent.size), dim=-1)  # of a and z
+            g_action = g_action + from_actions[t]  # (n, action); its two outputs, mean and spread, both get it
             gradient = torch.addcmul(
                 from_outputs[t], torch.cat((g_action, g_action), dim=-1), slopes_of_outputs[t], out=to_outputs[t]
             )
             for weight, to_layer, elu in back:
-                gradient = torch.mm(gradient, weight, out=to_layer[t]).mul_(elu[t])
-            if t > 0:
-                g_state = from_outside[t - 1]
+                gradient = torch.mm(gradient, weight, out=to_layer[t]).mul_(elu[t])  # (n, units)
+            if t > 0:  # the state to start in has no gradient
+                g_state = from_outside[t - 1]  # state t's, (n, stoch + deter)
                 if settings.through_input:
                     g_state = torch.addmm(g_state, gradient, weights[0])
                 g_stoch, g_remembered = g_state.split((latent.size, size), dim=-1)
