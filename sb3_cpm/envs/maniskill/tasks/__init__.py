@@ -1,9 +1,9 @@
 """
 Tasks of the report (section 5) that ManiSkill 3 lacks, after the definitions of ManiSkill 2 (version 0.5.3):
 
-* ``LiftCube-v1`` (:mod:`sb3_cpm.envs.tasks.lift_cube`), of the original PPO tutorial
-* ``PickSingleEGAD-v1`` (:mod:`sb3_cpm.envs.tasks.pick_single_egad`)
-* ``TurnFaucetDense-v1`` (:mod:`sb3_cpm.envs.tasks.turn_faucet`): TurnFaucet-v1 with the dense reward that it lost
+* ``LiftCube-v1`` (:mod:`sb3_cpm.envs.maniskill.tasks.lift_cube`), of the original PPO tutorial
+* ``PickSingleEGAD-v1`` (:mod:`sb3_cpm.envs.maniskill.tasks.pick_single_egad`)
+* ``TurnFaucetDense-v1`` (:mod:`sb3_cpm.envs.maniskill.tasks.turn_faucet`): TurnFaucet-v1 with the dense reward that it lost
 
 They are ordinary ManiSkill tasks, batched, and ``gym.make`` finds them once :func:`register_tasks` was called, which
 :func:`sb3_cpm.envs.make_maniskill_env` does.
@@ -32,7 +32,7 @@ def register_tasks() -> None:
     :raises ImportError: if ManiSkill is not installed
     """
     # importing registers, like ManiSkill's own tasks; each module once in a process
-    from sb3_cpm.envs.tasks import lift_cube, pick_single_egad, turn_faucet  # noqa: F401
+    from sb3_cpm.envs.maniskill.tasks import lift_cube, pick_single_egad, turn_faucet  # noqa: F401
 
 
 def registered_name(env_id: str, reward_mode: str) -> str:

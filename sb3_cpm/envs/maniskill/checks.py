@@ -9,9 +9,9 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from sb3_cpm.arguments import argument_names, nearest
-from sb3_cpm.envs.assets import missing_assets, require_assets
-from sb3_cpm.envs.rendering import Renderer, ensure_renderer, without_renderer
-from sb3_cpm.envs.tasks import register_tasks, registered_name
+from sb3_cpm.envs.maniskill.assets import missing_assets, require_assets
+from sb3_cpm.envs.maniskill.tasks import register_tasks, registered_name
+from sb3_cpm.machine.rendering import Renderer, ensure_renderer, without_renderer
 
 DEFAULT_ROBOT = "panda_wristcam"
 """The Panda with a camera at its hand, the report's robot."""

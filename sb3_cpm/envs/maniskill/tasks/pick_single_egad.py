@@ -25,7 +25,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.pose import Pose
 
-from sb3_cpm.envs.tasks.lift_cube import GRASP_ANGLE
+from sb3_cpm.envs.maniskill.tasks.lift_cube import GRASP_ANGLE
 
 FOLDER = "mani_skill2_egad"
 MODELS = "info_pick_train_v0.json"
