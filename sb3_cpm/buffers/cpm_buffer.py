@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from sb3_cpm.arguments import names_checked
-from sb3_cpm.buffers.checks import check_arguments, check_shares, checked_infos
+from sb3_cpm.buffers.checks import check_buffer_arguments, check_shares, checked_infos
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import NOT_SAVED, EpisodeBuffer
@@ -123,7 +123,7 @@ class CPMBuffer(EpisodeBuffer):
         player_keys: Sequence[str] | None = None,
     ):
         given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
-        check_arguments(
+        check_buffer_arguments(
             observation_space, action_space, challenge_ratio, demonstration_ratio, mix, max_challenges, refresh_every
         )
         super().__init__(

@@ -47,7 +47,7 @@ from sb3_cpm.buffers.checks import (
 from sb3_cpm.buffers.compact import StorageSpec, make_codecs
 from sb3_cpm.buffers.saving import pack_space, unpack_space
 from sb3_cpm.buffers.sequences import draw_starts, read_sequences
-from sb3_cpm.buffers.storage import Episode, NextObservationView, ObservationRing, Transitions
+from sb3_cpm.buffers.storage import Episode, Locations, NextObservationView, ObservationRing
 from sb3_cpm.files import Archive, DamagedFileError, write_archive
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.type_aliases import SequenceBatch
@@ -410,7 +410,7 @@ class EpisodeBuffer(HerReplayBuffer):
         """As the parent's."""
         return self._hindsight_goals(self.ring.locate(batch_indices, env_indices), len(batch_indices))
 
-    def _hindsight_goals(self, at: Transitions, n: int) -> np.ndarray:
+    def _hindsight_goals(self, at: Locations, n: int) -> np.ndarray:
         """
         Goals for the first n transitions by ``goal_selection_strategy``. (NumPy's ``randint`` between arrays, which the parent
         uses, takes longer than all the rest of ``sample``.)

@@ -5,7 +5,7 @@ Tasks of the report (section 5) that ManiSkill 3 lacks, after the definitions of
 * ``PickSingleEGAD-v1`` (:mod:`sb3_cpm.envs.maniskill.tasks.pick_single_egad`)
 * ``TurnFaucetDense-v1`` (:mod:`sb3_cpm.envs.maniskill.tasks.turn_faucet`): TurnFaucet-v1 with the dense reward that it lost
 
-They are ordinary ManiSkill tasks, batched, and ``gym.make`` finds them once :func:`register_tasks` was called, which
+They are ordinary ManiSkill tasks, batched, and ``gym.make`` finds them once :func:`register_report_tasks` was called, which
 :func:`sb3_cpm.envs.make_maniskill_env` does.
 """
 
@@ -25,7 +25,7 @@ DENSE = {"TurnFaucet-v1": "TurnFaucetDense-v1"}
 """Tasks that have their dense rewards under another name."""
 
 
-def register_tasks() -> None:
+def register_report_tasks() -> None:
     """
     Make the tasks known to ManiSkill and gymnasium. Can be repeated.
 

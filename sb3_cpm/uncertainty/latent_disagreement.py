@@ -13,12 +13,12 @@ from sb3_cpm.uncertainty.base import LatentSizes, Transitions
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.scale import ExpScale, ScaledUncertainty, some_of
 
-__all__ = ["TARGETS", "Ensemble", "ExpScale", "Plan2Explore"]
+__all__ = ["TARGETS", "Ensemble", "ExpScale", "LatentDisagreement"]
 
 TARGETS = ("feat", "stoch", "deter", "embed")
 
 
-class Plan2Explore(ScaledUncertainty):
+class LatentDisagreement(ScaledUncertainty):
     """
     In imagination it computes exactly what it computes on real transitions: a disagreement needs no outcome.
 
