@@ -67,14 +67,14 @@ def examine() -> Iterator[Finding]:
     """:return: the findings, one by one, since the last ones take some seconds"""
     yield _python()
     yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
-    torch = _torch()
-    yield torch
+    th = _torch()
+    yield th
     yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
     yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
     yield _memory()
     yield _disk()
     yield _video()
-    yield from _rendering(torch.well)
+    yield from _rendering(th.well)
 
 
 def _python() -> Finding:
@@ -93,14 +93,14 @@ def _package(name: str, cure: str) -> Finding:
 
 def _torch() -> Finding:
     try:
-        import torch
+        import torch as th
     except (ImportError, OSError) as error:  # OSError: a CUDA library that is not there
         return Finding("torch", False, str(error).splitlines()[0], "install torch, see https://pytorch.org")
-    if torch.cuda.is_available():
-        device = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    if th.cuda.is_available():
+        device = ", ".join(th.cuda.get_device_name(i) for i in range(th.cuda.device_count()))
     else:
-        device = f"no GPU, {torch.get_num_threads()} CPU threads of {os.cpu_count()} cores"
-    return Finding("torch", True, f"{torch.__version__}, {device}")
+        device = f"no GPU, {th.get_num_threads()} CPU threads of {os.cpu_count()} cores"
+    return Finding("torch", True, f"{th.__version__}, {device}")
 
 
 def _memory() -> Finding:

@@ -13,7 +13,7 @@ through the action at once, and through the latent behind the dreamt embedding.
 
 from typing import Any
 
-import torch
+import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
 from sb3_cpm.uncertainty.ensemble import Ensemble, ensemble_loss
@@ -36,23 +36,23 @@ class ObservationEnsemble(ScaledUncertainty):
         self.dream = DreamtEmbedding(sizes.feat, sizes.embed, units)
         self.ensemble = Ensemble(heads, sizes.embed + sizes.action, sizes.embed, layers, units)
 
-    def predict(self, transitions: Transitions) -> list[torch.Tensor]:
+    def predict(self, transitions: Transitions) -> list[th.Tensor]:
         """Predicted standardised embeddings of all heads, each of shape ``(*batch, embed_dim)``."""
         return self.ensemble.predictions(self._inputs(transitions))
 
-    def raw(self, transitions: Transitions) -> torch.Tensor:
+    def raw(self, transitions: Transitions) -> th.Tensor:
         return self.ensemble.disagreement(self._inputs(transitions))
 
-    def _inputs(self, transitions: Transitions) -> torch.Tensor:
-        return torch.cat((self.dream(transitions.feat, transitions.embed), transitions.action), dim=-1)
+    def _inputs(self, transitions: Transitions) -> th.Tensor:
+        return th.cat((self.dream(transitions.feat, transitions.embed), transitions.action), dim=-1)
 
-    def loss(self, transitions: Transitions) -> torch.Tensor:
+    def loss(self, transitions: Transitions) -> th.Tensor:
         assert transitions.embed is not None and transitions.next_embed is not None, "only real transitions have embeddings"
         loss = ensemble_loss(self.predict(transitions), self.dream.norm(transitions.next_embed))
         return loss + self.dream.loss(transitions.feat, transitions.embed)
 
-    @torch.no_grad()
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    @th.no_grad()
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         assert transitions.next_embed is not None
         self.dream.norm.update(transitions.next_embed)
         return super().adapt(transitions)
