@@ -22,7 +22,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.files import replacing
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
 class FixedEpisodes(BaseCallback):

@@ -13,18 +13,24 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from sb3_cpm import __version__
-from sb3_cpm.run.settings import ALGORITHMS, TrainSettings, field_documentation
+from sb3_cpm.run.settings import TrainSettings, field_documentation
 
 EPILOG = """examples:
-  python -m sb3_cpm train                                       CPM-SAC on PickCube-v1, the defaults
+  python -m sb3_cpm train --agent cpm_sac_quick                 CPM-SAC on PickCube-v1, shortened to an hour without a GPU
   python -m sb3_cpm train --env CPMToy-v0 --steps 3000          a small task that needs no renderer
-  python -m sb3_cpm train --env Pendulum-v1 --algorithm td3     any gymnasium task with continuous actions
+  python -m sb3_cpm train --env Pendulum-v1 --agent cpm_td3     any gymnasium task with continuous actions
   python -m sb3_cpm train --env-kwargs image_size=64 cameras=[base_camera]
-  python -m sb3_cpm watch runs/PickCube-v1-sac-seed0            what the world model of a run believes it will see
+  python -m sb3_cpm train --resume runs/CPMToy-v0-cpm_sac-seed0 go on with a run that was cut off
+  python -m sb3_cpm watch runs/CPMToy-v0-cpm_sac-seed0          what the world model of a run believes it will see
   python -m sb3_cpm reproduce --figure 4 --quick                an experiment of the report
 """
-CHOICES = {"algorithm": ALGORITHMS, "unit": ("step", "segment", "episode")}
-TYPES = {"steps": int, "gamma": float, "tau": float, "buffer_size": int, "learning_starts": int}
+CHOICES = {"unit": ("step", "segment", "episode")}
+#: Of settings without a default.
+TYPES = {
+    **dict.fromkeys(("challenge_ratio", "learning_rate", "gamma", "tau"), float),
+    **dict.fromkeys(("steps", "n_envs", "buffer_size", "batch_size", "train_freq", "gradient_steps", "learning_starts"), int),
+    **dict.fromkeys(("challenger_train_freq", "challenger_gradient_steps"), int),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -60,7 +60,7 @@ class ChallengerCallback(BaseCallback):
     :param preset: sizes and learning rates of the challenger, the name of one of :data:`sb3_cpm.presets.PRESETS` or a dict
     :param keys: observation keys that the challenger reads. None: all images and vectors, not point clouds (with the
         preset ``"report_images"``: all images)
-    :param uncertainty_class: estimator of epistemic uncertainty, a name or a class
+    :param uncertainty_class: estimator of epistemic uncertainty, a name or a class; None: the preset's
     :param uncertainty_kwargs: its arguments
     :param challenger_kwargs: entries of the preset to override
     :param decay: decay model of the exploration probability epsilon, a name or a function of the remaining progress,
@@ -87,7 +87,7 @@ class ChallengerCallback(BaseCallback):
         self,
         preset: str | dict[str, Any] = "default",
         keys: Sequence[str] | None = None,
-        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_class: str | type[Uncertainty] | None = None,
         uncertainty_kwargs: dict[str, Any] | None = None,
         challenger_kwargs: dict[str, Any] | None = None,
         decay: str | Schedule = "linear",

@@ -54,6 +54,10 @@ class DamagedFileError(ValueError):
     """A file is not what was written: cut off, changed, or something else."""
 
 
+class DamagedRunError(ValueError):
+    """The files of a run are not what a run leaves."""
+
+
 class NotFiniteError(RuntimeError):
     """Weights with NaN or infinity, which never replace a file with better ones."""
 

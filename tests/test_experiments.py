@@ -18,21 +18,21 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
 from sb3_cpm.__main__ import main
+from sb3_cpm.agents import load_agent
 from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_data, find_experiment, run_experiment, summary_table
 from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
 from sb3_cpm.experiments.collect import Data, collect
-from sb3_cpm.experiments.evaluation import evaluate
 from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES, write_title
 from sb3_cpm.experiments.grid import attempt, perform_all
-from sb3_cpm.experiments.player_losses import player_losses
-from sb3_cpm.experiments.run_folder import description
 from sb3_cpm.experiments.single_run import Watcher, perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.files import LockedError, locked
-from sb3_cpm.run.evaluation import FIRST_SEED
-from sb3_cpm.zoo.agents import load_agent
+from sb3_cpm.run.evaluation import evaluate
+from sb3_cpm.run.folder import description
+from sb3_cpm.run.player_losses import player_losses
+from sb3_cpm.seeds import FIRST_SEED
 
 TINY = {
     "policy": "MultiInputPolicy",

@@ -16,13 +16,13 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetExtractor
+from sb3_cpm.agents.checks import check_hyperparameters
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.dreamer.spaces import as_dict_space
 from sb3_cpm.presets import ENTRIES, make_preset
 from sb3_cpm.spaces import looks_like_cloud
 from sb3_cpm.world_model.networks import Encoder
 from sb3_cpm.world_model.observations import ObservationSpec, is_rangeless_image, unread
-from sb3_cpm.zoo.checks import check_hyperparameters
 
 FUZZ = settings(
     max_examples=int(os.environ.get("SB3_CPM_FUZZ", "100")),

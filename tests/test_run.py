@@ -22,12 +22,13 @@ from sb3_cpm.envs import DictObservation
 from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run import environment as environments
 from sb3_cpm.run.environment import make_env
-from sb3_cpm.run.evaluation import FIRST_SEED, play_episode
+from sb3_cpm.run.evaluation import play_episode
 from sb3_cpm.run.folder import RunFolder
 from sb3_cpm.run.plots import read_csv, running_mean
 from sb3_cpm.run.recorder import CSVTable
 from sb3_cpm.run.summary import Summary, complete_times
 from sb3_cpm.run.training import make_model
+from sb3_cpm.seeds import FIRST_SEED
 
 SMALL: dict[str, Any] = {
     "env": "CPMToy-v0",

@@ -27,16 +27,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
+from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm import files
 from sb3_cpm.__main__ import main
 from sb3_cpm.buffers import CPMBuffer, Demonstration
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.challenges.state import restored, state_of
-from sb3_cpm.experiments import checkpoint as checkpoints
+from sb3_cpm.checkpoint import save_model
 from sb3_cpm.files import NotFiniteError
 from sb3_cpm.run import train
-from sb3_cpm.run.folder import save_model
 from sb3_cpm.run.watch import watch
 from sb3_cpm.type_aliases import Evaluation
 

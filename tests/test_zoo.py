@@ -28,15 +28,16 @@ from stable_baselines3.common.envs import BitFlippingEnv
 from warm_python import WarmPython
 
 from sb3_cpm import ChallengerCallback, CPMBuffer
+from sb3_cpm.agents import load_agent
+from sb3_cpm.agents.configs import config_folder, read_entries
+from sb3_cpm.agents.tasks import ENV_IDS, TASKS, env_id_of
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor
 from sb3_cpm.presets import CHALLENGES
-from sb3_cpm.zoo import ENV_IDS, TASKS, env_id_of, search
+from sb3_cpm.zoo import search
 from sb3_cpm.zoo.__main__ import complete, main
-from sb3_cpm.zoo.agents import config_folder, load_agent
 from sb3_cpm.zoo.bridge import install
-from sb3_cpm.zoo.checks import read_entries
 from sb3_cpm.zoo.policies import CameraExtractor
 from sb3_cpm.zoo.resume import challenger_file
 from sb3_cpm.zoo.wrappers import RGBD, TerminationIsSuccess, as_dict

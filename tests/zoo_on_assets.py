@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from rl_zoo3.exp_manager import ExperimentManager
 
-from sb3_cpm.zoo.agents import Agent, config_folder, load_agent
-from sb3_cpm.zoo.checks import read_entries
-from sb3_cpm.zoo.registration import ENV_IDS
+from sb3_cpm.agents import Agent, load_agent
+from sb3_cpm.agents.configs import config_folder, read_entries
+from sb3_cpm.agents.tasks import ENV_IDS
 
 #: Tasks that are not about bringing an object to a place.
 GOALLESS = ("CPM/LiftCube-v1", "CPM/TurnFaucet-v1", "CPM/OpenCabinetDoor-v1")

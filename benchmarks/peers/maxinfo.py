@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from sb3_cpm.agents import agent
+from sb3_cpm.agents.algorithms import algorithms
 from sb3_cpm.experiments.catalog import SAC as PLAYER
 from sb3_cpm.experiments.catalog import find_experiment
 from sb3_cpm.experiments.single_run import perform
 from sb3_cpm.experiments.specification import Contender, RunSpec
-from sb3_cpm.zoo import agents
-from sb3_cpm.zoo.checks import algorithms
 
 RESULTS = Path(__file__).parents[2] / "results"
 #: "features", "learn_std" and "optimizer_kwargs" of examples/dmc
@@ -51,9 +51,9 @@ def main() -> None:
             plan.steps, plan.eval_every, plan.eval_episodes, plan.eval_seed,
         )  # fmt: skip
         with (
-            patch.object(agents, "algorithms", lambda: {**algorithms(), "sac": Peer}),
+            patch.object(agent, "algorithms", lambda: {**algorithms(), "sac": Peer}),
             # it cannot be loaded again, so that a run goes from beginning to end
-            patch("sb3_cpm.experiments.checkpoint.save_checkpoint", lambda *arguments: None),
+            patch("sb3_cpm.checkpoint.save_checkpoint", lambda *arguments: None),
             patch("sb3_cpm.experiments.single_run.find_twin", lambda *arguments: None),
         ):
             print(perform(spec, args.results, print), flush=True)

@@ -27,7 +27,7 @@ from sheeprl.algos.dreamer_v2.agent import PlayerDV2
 from peers.sheeprl_dreamer import SheeprlDreamer
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer.spaces import as_dict, as_dict_space
-from sb3_cpm.run.evaluation import FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
 class Player:

@@ -54,7 +54,8 @@ class Challenger:
         entries, see :mod:`sb3_cpm.presets`
     :param keys: the observation keys to read; all images, and vectors unless the preset leaves them out, by default
     :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
-        :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`
+        :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`. None: the preset's, which
+        is "observation_ensemble" in the default and "plan2explore" in the report's
     :param uncertainty_kwargs: arguments for it, on top of the preset's
     :param overrides: single preset entries
     :raises ValueError: for spaces it cannot work with, unknown preset entries, and arguments that no file can hold
@@ -67,7 +68,7 @@ class Challenger:
         device: th.device | str = "auto",
         preset: PresetLike = "default",
         keys: Sequence[str] | None = None,
-        uncertainty_class: str | type[Uncertainty] = "plan2explore",
+        uncertainty_class: str | type[Uncertainty] | None = None,
         uncertainty_kwargs: Mapping[str, Any] | None = None,
         **overrides: Any,
     ) -> None:

@@ -1,6 +1,7 @@
 """The CSV files of an experiment as tables, with everything odd about them said."""
 
 import contextlib
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_cpm.experiments.specification import Experiment, options_of
-from sb3_cpm.experiments.stored_run import DamagedRunError, StoredRun, read_run
-from sb3_cpm.experiments.tables import COLUMNS
+from sb3_cpm.files import DamagedRunError
+from sb3_cpm.run.stored_run import StoredRun, read_run
+from sb3_cpm.run.tables import COLUMNS
 
 IDENTITY = ["agent", "env", "seed"]
 #: Of what a run was made with, what agents that are drawn together should have in common.
@@ -108,6 +110,8 @@ def _read(folders: list[Path], notes: list[str]) -> dict[Path, StoredRun]:
     runs, damaged = {}, []
     for folder in folders:
         try:
+            if not re.fullmatch(r"seed\d+", folder.name):
+                raise DamagedRunError("the folder of a run is called seedN")
             runs[folder] = read_run(folder)
         except DamagedRunError as error:
             damaged.append(f"{_name(folder)} ({error})")

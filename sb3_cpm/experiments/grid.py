@@ -13,10 +13,9 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_cpm.experiments.run_folder import CRASHED, OtherResultError, is_finished, write_crashed
 from sb3_cpm.experiments.specification import RunResult, RunSpec
-from sb3_cpm.experiments.stored_run import DamagedRunError
-from sb3_cpm.files import LockedError
+from sb3_cpm.files import DamagedRunError, LockedError
+from sb3_cpm.run.folder import CRASHED, OtherResultError, is_finished, write_crashed
 
 Tell = Callable[[str], None]
 #: What a worker process ends with, by outcome; every other status is a crash.

@@ -1,14 +1,13 @@
 """What a run, its outcome and an experiment are: plain data."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from sb3_cpm.arguments import nearest
-from sb3_cpm.run.settings import FIRST_SEED
+from sb3_cpm.run.specification import RunSpec
+from sb3_cpm.seeds import FIRST_SEED
 
 #: How much of an experiment is run: as planned; on its own tasks, but as few steps as two cores can bear; in minutes.
 VERSIONS = ("full", "short", "quick")
@@ -27,50 +26,6 @@ def options_of(version: str) -> str:
     return ("" if planned == "full" else f" --{planned}") + (f" --steps {steps}" if trial else "")
 
 
-@dataclass(frozen=True)
-class RunSpec:
-    """
-    Everything that determines one run, except the versions of the packages.
-
-    :param experiment: name of the folder that its results go to
-    :param agent: name of the contender, a folder below that
-    :param env: name of the task, a folder below that
-    :param seed: rules the whole run
-    :param config: the agent's file, a name in ``zoo_configs/`` or a path
-    :param env_id: a gymnasium id
-    :param overrides: hyperparameters that differ from the file's
-    :param steps: environment steps to train for
-    :param eval_every: environment steps between two evaluations
-    :param eval_episodes: episodes of each
-    :param eval_seed: of the first of them, the others' follow
-    """
-
-    experiment: str
-    agent: str
-    env: str
-    seed: int
-    config: str
-    env_id: str
-    overrides: dict[str, Any]
-    steps: int
-    eval_every: int
-    eval_episodes: int
-    eval_seed: int = FIRST_SEED
-
-    @property
-    def name(self) -> str:
-        """For people: which run this is."""
-        return f"{self.experiment}/{self.agent}/{self.env}/seed{self.seed}"
-
-    def folder(self, results: Path) -> Path:
-        """:return: where the results of this run are"""
-        return results / self.experiment / self.agent / self.env / f"seed{self.seed}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """:return: plain data"""
-        return asdict(self)
-
-
 class RunResult(NamedTuple):
     """
     What became of a run.
@@ -86,14 +41,6 @@ class RunResult(NamedTuple):
     outcome: str
     message: str
     folder: Path
-
-
-def fingerprint(protocol: dict[str, Any]) -> str:
-    """
-    :param protocol: plain data that says what a result was made with
-    :return: twelve characters that differ whenever it does
-    """
-    return hashlib.sha256(json.dumps(protocol, sort_keys=True, default=str).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -241,7 +188,7 @@ class Experiment:
         :raises ValueError: for a version that this experiment does not have, fewer seeds or steps than one, or a name, with
             the nearest
         """
-        from sb3_cpm.zoo.agents import algorithm_of
+        from sb3_cpm.agents.algorithms import algorithm_of
 
         if seeds is not None and seeds < 1:
             raise ValueError(f"seeds={seeds}: expected 1 or more")
@@ -283,7 +230,7 @@ def _chosen(kind: str, names: Sequence[str] | None, all_of_them: Sequence[_Named
 
 
 def _merged(*overrides: dict[str, Any]) -> dict[str, Any]:
-    from sb3_cpm.zoo.agents import merge
+    from sb3_cpm.agents.configs import merge
 
     result: dict[str, Any] = {}
     for one in overrides:

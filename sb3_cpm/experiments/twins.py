@@ -9,17 +9,17 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from sb3_cpm.experiments import run_folder
 from sb3_cpm.experiments.specification import RunSpec
-from sb3_cpm.experiments.stored_run import read_run
-from sb3_cpm.experiments.tables import EVALUATIONS, Table
 from sb3_cpm.files import write_bytes
+from sb3_cpm.run import folder as run_folder
+from sb3_cpm.run.stored_run import read_run
+from sb3_cpm.run.tables import EVALUATIONS, Table
 
 
 def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:
     """
     :param spec: a run
-    :param config: its :func:`~sb3_cpm.experiments.run_folder.description`
+    :param config: its :func:`~sb3_cpm.run.folder.description`
     :param results: folder of all results
     :return: the folder of a finished run with the same settings, seed, version and code of this package, under another name
     """

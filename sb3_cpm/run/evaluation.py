@@ -1,148 +1,113 @@
-"""The deterministic player on episodes of its own: always the same seeds, which training never uses."""
+"""
+Deterministic evaluation of any SB3 model: always the same episodes, which training never sees.
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+Unlike SB3's ``evaluate_policy`` it seeds every episode, and tells success at the end from success at any moment: ManiSkill's
+``success`` is not sticky, an arm can reach its goal and leave it again.
+"""
+
+import copy
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.run.recorder import CSVTable
-from sb3_cpm.run.settings import FIRST_SEED as FIRST_SEED
+from sb3_cpm.seeds import FIRST_SEED
 
 
-class EpisodeResult(NamedTuple):
+class Outcome(NamedTuple):
     """
-    One evaluation episode.
+    One episode.
 
-    :param episode_return: sum of rewards
-    :param length: number of steps
-    :param success: whether it was a success at its end, None where the environment doesn't say
+    :param episode_return: sum of the task's own rewards (of ``Monitor``, below all reward wrappers)
+    :param length: steps
+    :param success_once: whether it was a success in any step, None where the environment doesn't say
+    :param success_at_end: whether it was one in the last step
     """
 
     episode_return: float
     length: int
-    success: bool | None
+    success_once: bool | None
+    success_at_end: bool | None
 
 
-def play_episode(model: BaseAlgorithm, env: gym.Env, seed: int, frames: list[np.ndarray] | None = None) -> EpisodeResult:
+def success_of(info: dict[str, Any]) -> bool | None:
+    """:return: what an info says about success, None if nothing; gymnasium-robotics says ``success``, SB3 ``is_success``"""
+    told = info.get("is_success", info.get("success"))
+    return None if told is None else bool(told)
+
+
+def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int, first_seed: int = FIRST_SEED) -> list[Outcome]:
     """
-    Play one episode with the deterministic player.
+    Play episodes with seeds from ``first_seed`` on.
+
+    :param model: the player; recurrent ones get their state back
+    :param env: one environment, made like those of the training and not one of them
+    :param n_episodes: how many
+    :param first_seed: training has the seeds below ``FIRST_SEED``
+    """
+    ours, theirs = unwrap_vec_normalize(env), model.get_vec_normalize_env()  # images are transposed outside of either
+    if ours is not None and theirs is not None:
+        if hasattr(theirs, "obs_rms"):  # not where only rewards are normalized
+            ours.obs_rms = copy.deepcopy(theirs.obs_rms)
+        ours.training = ours.norm_reward = False
+    return [_play(model, env, first_seed + index) for index in range(n_episodes)]
+
+
+def _play(model: BaseAlgorithm, env: VecEnv, seed: int) -> Outcome:
+    env.seed(seed)
+    observation = env.reset()
+    state, first, successes = None, np.ones(1, dtype=bool), []
+    while True:
+        action, state = model.predict(observation, state=state, episode_start=first, deterministic=True)  # type: ignore[arg-type]
+        observation, _, dones, infos = env.step(action)
+        first = dones
+        successes.append(success_of(infos[0]))
+        if dones[0]:
+            break
+    episode = infos[0]["episode"]
+    at_end = successes[-1]
+    return Outcome(float(episode["r"]), int(episode["l"]), None if at_end is None else any(successes), at_end)
+
+
+class _Filmed(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps a picture of every state: a ``VecEnv`` begins the next episode at once, and nobody else sees the last."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.frames: list[np.ndarray] = []
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        result = self.env.reset(**kwargs)
+        self._film()
+        return result
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        self._film()
+        return result
+
+    def _film(self) -> None:
+        frame = self.env.render()
+        assert isinstance(frame, np.ndarray), "made with render_mode='rgb_array'"
+        self.frames.append(frame)
+
+
+def film(model: BaseAlgorithm, env: VecEnv, seed: int = FIRST_SEED) -> tuple[Outcome, list[np.ndarray]]:
+    """
+    Play one episode as :func:`evaluate` does.
 
     :param model: the player
-    :param env: the environment
-    :param seed: for the reset
-    :param frames: pictures of the episode are appended to it, one per state, when it is given
+    :param env: as for :func:`evaluate`, made with ``render_mode="rgb_array"``, a ``DummyVecEnv`` below its wrappers
+    :param seed: of the episode
+    :return: the outcome, and a picture of every state, each of shape ``(height, width, 3)``, uint8
     """
-    observation, info = env.reset(seed=seed)
-    total, length, done = 0.0, 0, False
-    memory, start = None, np.ones(1, dtype=bool)  # of recurrent players such as Dreamer; others ignore both
-    while not done:
-        _film(env, frames)
-        action, memory = model.predict(observation, memory, start, deterministic=True)
-        start = np.zeros(1, dtype=bool)
-        observation, reward, terminated, truncated, info = env.step(action)
-        total += float(reward)
-        length += 1
-        done = terminated or truncated
-    _film(env, frames)
-    success = info.get("is_success")
-    return EpisodeResult(total, length, None if success is None else bool(success))
-
-
-def _film(env: gym.Env, frames: list[np.ndarray] | None) -> None:
-    if frames is not None:
-        frame = env.render()
-        assert isinstance(frame, np.ndarray)
-        frames.append(frame)
-
-
-class Evaluator(BaseCallback):
-    """
-    Evaluates the player at the start, at even distances, and at the end; writes ``evaluations.csv``.
-
-    :param env: environment of its own
-    :param folder: where the file goes
-    :param challenger: whose stopwatch is charged with "evaluation"
-    :param total_steps: length of the run
-    :param n_evaluations: how many, start and end included; 0 for none
-    :param n_episodes: episodes of each
-    :param after_each: called after each with a line about it
-    """
-
-    def __init__(
-        self,
-        env: gym.Env,
-        folder: Path,
-        challenger: ChallengerCallback,
-        total_steps: int,
-        n_evaluations: int,
-        n_episodes: int,
-        after_each: Callable[[str], None] = lambda news: None,
-    ) -> None:
-        super().__init__()
-        self.env = env
-        self.challenger = challenger
-        self.n_episodes = n_episodes
-        self.after_each = after_each
-        self.results: list[tuple[int, list[EpisodeResult]]] = []
-        #: Steps at which an evaluation is due, the last one excepted, which ``at_end`` makes.
-        self._due = [round(total_steps * index / (n_evaluations - 1)) for index in range(n_evaluations - 1)]
-        self._at_end = n_evaluations > 0
-        self._table = CSVTable(folder / "evaluations.csv")
-
-    def close(self) -> None:
-        self._table.close()
-        self.env.close()
-
-    def _on_training_start(self) -> None:
-        self._evaluate_if_due()
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        self._evaluate_if_due()
-
-    def at_end(self) -> None:
-        """The last evaluation, after training (``on_training_end`` doesn't know whether training came to its end)."""
-        if self._at_end:
-            self._evaluate()
-
-    def _evaluate_if_due(self) -> None:
-        if self._due and self.num_timesteps >= self._due[0]:
-            self._due = [step for step in self._due if step > self.num_timesteps]
-            self._evaluate()
-
-    def _evaluate(self) -> None:
-        with self.challenger.stopwatch.section("evaluation"):
-            results = [play_episode(self.model, self.env, FIRST_SEED + index) for index in range(self.n_episodes)]
-        self.results.append((self.num_timesteps, results))
-        success = success_rate(results)
-        returns = [result.episode_return for result in results]
-        mean_return = float(np.mean(returns))
-        self._table.add(
-            {
-                "step": self.num_timesteps,
-                "mean_return": mean_return,
-                "min_return": min(returns),
-                "max_return": max(returns),
-                "mean_length": float(np.mean([result.length for result in results])),
-                "success_rate": success,
-                "episodes": len(results),
-            }
-        )
-        self.logger.record("eval/mean_reward", mean_return)
-        if success is not None:
-            self.logger.record("eval/success_rate", success)
-        told = "" if success is None else f", success {success:.0%}"
-        self.after_each(f"step {self.num_timesteps}: evaluated return {mean_return:.2f}{told}")
-
-
-def success_rate(results: list[EpisodeResult]) -> float | None:
-    """:return: share of episodes that were a success at their end, None where the environment doesn't say"""
-    told = [result.success for result in results if result.success is not None]
-    return float(np.mean(told)) if told else None
+    inner = env.unwrapped
+    assert isinstance(inner, DummyVecEnv)
+    filmed = inner.envs[0] = _Filmed(inner.envs[0])
+    try:
+        outcome = evaluate(model, env, 1, seed)[0]
+    finally:
+        inner.envs[0] = filmed.env
+    return outcome, filmed.frames[: outcome.length + 1]  # what comes after it is of the next episode

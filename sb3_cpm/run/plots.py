@@ -1,6 +1,5 @@
 """Learning curve, and everything dynamic over time: drawn from the CSV files of a run folder, so also long afterwards."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_cpm.files import replacing, write_text
+from sb3_cpm.run.tables import read_csv
 
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#2b6cb0", "#dd6b20", "#2f855a", "#c53030", "#718096", "#6b46c1"
 PINK, BLACK = "#d53f8c", "#1a202c"
@@ -28,20 +28,6 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.8,
 }
-
-
-def read_csv(path: Path) -> dict[str, np.ndarray]:
-    """
-    :param path: a table of numbers
-    :return: one array per column, nan where a cell is empty; no columns when the file is missing or empty
-    """
-    if not path.exists():
-        return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        names = reader.fieldnames or []  # reads the first line if nobody has: not after the file is closed
-        rows = list(reader)
-    return {name: np.array([float(row[name]) if row[name] else np.nan for row in rows]) for name in names}
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -66,10 +52,11 @@ def learning_curve(folder: Path, title: str) -> None:
     """
     Draw ``learning_curve.png`` and write ``learning_curve.csv``: training episodes and evaluations in one table.
 
-    :param folder: the run folder, with episodes.csv and evaluations.csv
+    :param folder: the run folder, with training.csv and evaluations.csv
     :param title: what was trained
     """
-    episodes, evaluations = read_csv(folder / "episodes.csv"), read_csv(folder / "evaluations.csv")
+    episodes, evaluations = read_csv(folder / "training.csv"), _per_evaluation(read_csv(folder / "evaluations.csv"))
+    episodes = episodes if len(episodes.get("step", ())) else {}
     _write_learning_csv(folder / "learning_curve.csv", episodes, evaluations)
     with plt.rc_context(STYLE):
         figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 6.5), sharex=True, height_ratios=[3, 2], layout="constrained")
@@ -80,8 +67,27 @@ def learning_curve(folder: Path, title: str) -> None:
         save_figure(figure, folder / "learning_curve.png")
 
 
-def _window(episodes: dict[str, np.ndarray]) -> int:
-    return int(np.clip(len(episodes["step"]) // 8, 3, 50))
+def _per_evaluation(episodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """
+    :return: mean, worst and best return and share of successes at the end, for every step with an evaluation
+    """
+    if not len(episodes.get("step", ())):
+        return {}
+    steps = np.unique(episodes["step"])
+    groups = [episodes["step"] == step for step in steps]
+    returns = [episodes["return"][group] for group in groups]
+    successes = [episodes["success_at_end"][group] for group in groups]
+    return {
+        "step": steps,
+        "mean_return": np.array([one.mean() for one in returns]),
+        "min_return": np.array([one.min() for one in returns]),
+        "max_return": np.array([one.max() for one in returns]),
+        "success_rate": np.array([one[np.isfinite(one)].mean() if np.isfinite(one).any() else np.nan for one in successes]),
+    }
+
+
+def _window(table: dict[str, np.ndarray]) -> int:
+    return int(np.clip(len(table["step"]) // 8, 3, 50))
 
 
 def _draw_returns(axes: Axes, episodes: dict[str, np.ndarray], evaluations: dict[str, np.ndarray]) -> None:
@@ -116,8 +122,8 @@ def _legend_above(axes: Axes) -> None:
 
 def _draw_success(axes: Axes, episodes: dict[str, np.ndarray], evaluations: dict[str, np.ndarray]) -> None:
     axes.set_title("Success")
-    if episodes and np.isfinite(episodes["success"]).any():
-        axes.plot(episodes["step"], running_mean(episodes["success"], _window(episodes)), color=BLUE, label="training")
+    if episodes and np.isfinite(episodes["success_at_end"]).any():
+        axes.plot(episodes["step"], running_mean(episodes["success_at_end"], _window(episodes)), color=BLUE, label="training")
     if evaluations and np.isfinite(evaluations["success_rate"]).any():
         axes.plot(evaluations["step"], evaluations["success_rate"], "o-", color=ORANGE, ms=6, lw=1.2, label="evaluation")
     if axes.lines:
@@ -131,7 +137,7 @@ def _draw_success(axes: Axes, episodes: dict[str, np.ndarray], evaluations: dict
 def _write_learning_csv(path: Path, episodes: dict[str, np.ndarray], evaluations: dict[str, np.ndarray]) -> None:
     rows: list[tuple[float, str, float, float]] = []
     if episodes:
-        columns = (episodes["step"], episodes["return"], episodes["success"])
+        columns = (episodes["step"], episodes["return"], episodes["success_at_end"])
         rows += [(step, "train", total, success) for step, total, success in zip(*columns, strict=True)]
     if evaluations:
         columns = (evaluations["step"], evaluations["mean_return"], evaluations["success_rate"])
@@ -150,12 +156,11 @@ def coefficients(folder: Path, title: str) -> None:
     :param title: what was trained
     """
     table, proposals = _settled(read_csv(folder / "coefficients.csv")), read_csv(folder / "proposals.csv")
-    episodes = read_csv(folder / "episodes.csv")
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(3, 2, figsize=(11, 9), sharex=True, layout="constrained")
         figure.suptitle(title, fontweight="bold")
         panels = list(grid.flat)
-        _draw_epsilon(panels[0], table, episodes)
+        _draw_epsilon(panels[0], table)
         _lines(panels[1], table, "Challenges, counted", [("proposed", GREY), ("kept", GREEN), ("in_buffer", BLUE)])
         panels[1].set_ylabel("challenges")
         _lines(panels[2], table, "Coefficients of the score  S = c r + c1 KL + DISAG", [("c", BLUE), ("c1", ORANGE)], True)
@@ -190,11 +195,11 @@ def _settled(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return table
 
 
-def _draw_epsilon(axes: Axes, table: dict[str, np.ndarray], episodes: dict[str, np.ndarray]) -> None:
+def _draw_epsilon(axes: Axes, table: dict[str, np.ndarray]) -> None:
     _lines(axes, table, "Exploration: who acts", [("epsilon", BLUE)], names={"epsilon": "epsilon, probability that C acts"})
-    if episodes:
-        share = running_mean(episodes["explored_share"], _window(episodes))
-        axes.plot(episodes["step"], share, ":", color=ORANGE, label="share of actions that C gave (running mean)")
+    if table:
+        share = running_mean(table["explored_share"], _window(table))
+        axes.plot(table["step"], share, ":", color=ORANGE, label="share of actions that C gave (running mean)")
         axes.legend(loc="best", fontsize=9)
     axes.set_ylim(0, 1)
 

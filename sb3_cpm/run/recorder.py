@@ -1,12 +1,10 @@
 """
-What happened, episode by episode and proposal by proposal, on disk at once.
+What the challenger does, proposal by proposal, on disk at once.
 
-Three CSV files grow while the run goes on (every row is flushed, so that not even a crash loses one), and a few proposals
-are kept in memory with their camera frames for the challenge gallery.
+Two CSV files grow while the run goes on (every row is flushed, so that not even a crash loses one), and a few proposals are
+kept in memory with their camera frames for the challenge gallery.
 """
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,32 +17,9 @@ from stable_baselines3.common.preprocessing import is_image_space, is_image_spac
 
 from sb3_cpm.buffers import EXECUTED_ACTION, Episode
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.challenges import REWARD_TERMS, Proposal
-from sb3_cpm.files import GrowingFile
-
-
-class CSVTable:
-    """
-    A CSV file whose columns are those of its first row; complete after every row, or as soon as the disk takes it.
-
-    :param path: the file, which must not exist yet
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file = GrowingFile(path)
-        self._columns: list[str] | None = None
-
-    def add(self, row: dict[str, Any]) -> None:
-        text = io.StringIO()
-        if self._columns is None:
-            self._columns = list(row)
-            csv.writer(text).writerow(self._columns)
-        values = {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()}
-        csv.DictWriter(text, self._columns, extrasaction="ignore").writerow(values)
-        self._file.append(text.getvalue())
-
-    def close(self) -> None:
-        self._file.close()
+from sb3_cpm.challenges import REWARD_TERMS, ArtificialRewards, Proposal
+from sb3_cpm.packing import pack, unpack
+from sb3_cpm.run.tables import GrownTable
 
 
 @dataclass(frozen=True)
@@ -66,6 +41,10 @@ class Shot:
     frames: dict[str, np.ndarray]
 
 
+#: What a :class:`Shot` consists of, for files.
+_SHOT_CLASSES = (Shot, Episode, Proposal, ArtificialRewards)
+
+
 @dataclass
 class ShotKeeper:
     """
@@ -84,7 +63,7 @@ class ShotKeeper:
     def add(self, progress: float, shot: Shot) -> None:
         self._shots[self._part(progress), shot.proposal.accepted] = shot
 
-    def choose(self, n_shots: int) -> list[Shot]:
+    def choose(self, n_shots: int = 6) -> list[Shot]:
         """:return: at most ``n_shots`` in order of time, a third of them dropped ones where there are enough of both"""
         kept = [self._shots[key] for key in sorted(self._shots) if key[1]]
         dropped = [self._shots[key] for key in sorted(self._shots) if not key[1]]
@@ -98,69 +77,72 @@ class ShotKeeper:
 
 class Recorder(BaseCallback):
     """
-    Writes ``episodes.csv``, ``proposals.csv`` and ``coefficients.csv``; to be listed after the ``ChallengerCallback``.
+    Writes ``proposals.csv`` and ``coefficients.csv``; to be listed after the ``ChallengerCallback``.
 
     :param folder: where the files go
     :param challenger: the callback that makes the proposals
     :param total_steps: length of the run, to spread the gallery's proposals over it
+    :param state: what :meth:`state` gave at the checkpoint that the run goes on from
+    :raises DamagedFileError: if the files are not what they were at that checkpoint
     """
 
-    def __init__(self, folder: Path, challenger: ChallengerCallback, total_steps: int) -> None:
+    def __init__(
+        self, folder: Path, challenger: ChallengerCallback, total_steps: int, state: dict[str, Any] | None = None
+    ) -> None:
         super().__init__()
+        state = state or {}
         self.challenger = challenger
         self.total_steps = total_steps
-        self.shots = ShotKeeper()
-        self.n_proposals = 0
-        self.n_episodes = 0
-        self._n_actions = self._n_explored = 0
-        self._tables = {name: CSVTable(folder / f"{name}.csv") for name in ("episodes", "proposals", "coefficients")}
-        self._explored: np.ndarray = np.zeros(0)
-        self._episode_ended = False
+        self.shots = ShotKeeper(_shots=unpack(state["shots"], _SHOT_CLASSES) if "shots" in state else {})
+        self.n_proposals: int = state.get("n_proposals", 0)
+        #: Actions so far, and those of them that C gave: since the beginning, and since the last row of ``coefficients.csv``.
+        self._actions: list[int] = state.get("actions", [0, 0])
+        self._recent: list[int] = state.get("recent", [0, 0])
+        tables = state.get("tables", {})
+        names = ("proposals", "coefficients")
+        self._tables = {name: GrownTable(folder / f"{name}.csv", **tables.get(name, {})) for name in names}
+        self._episode_ended: bool = state.get("episode_ended", False)
 
     @property
     def explored_share(self) -> float | None:
         """Share of all actions so far that C gave, None before the first."""
-        return self._n_explored / self._n_actions if self._n_actions else None
+        return self._actions[1] / self._actions[0] if self._actions[0] else None
+
+    def state(self) -> dict[str, Any]:
+        """
+        :return: plain data for a checkpoint
+        :raises NotWrittenError: if a row is not on the disk
+        """
+        return {
+            "n_proposals": self.n_proposals,
+            "actions": list(self._actions),
+            "recent": list(self._recent),
+            "episode_ended": self._episode_ended,
+            "shots": pack(self.shots._shots, _SHOT_CLASSES, "the gallery"),
+            "tables": {name: table.state() for name, table in self._tables.items()},
+        }
 
     def close(self) -> None:
         for table in self._tables.values():
             table.close()
 
-    def _on_training_start(self) -> None:
-        self._explored = np.zeros(self.training_env.num_envs)
-
     def _on_step(self) -> bool:
-        for env_idx, info in enumerate(self.locals["infos"]):
-            explored = EXECUTED_ACTION in info
-            self._explored[env_idx] += explored
-            self._n_explored += explored
-            self._n_actions += 1
-            if "episode" in info:
-                length = int(info["episode"]["l"])
-                self._tables["episodes"].add(
-                    {
-                        "step": self.num_timesteps,
-                        "env": env_idx,
-                        "return": float(info["episode"]["r"]),
-                        "length": length,
-                        "success": _optional_int(info.get("is_success")),
-                        "explored_share": self._explored[env_idx] / length,
-                        "epsilon": self.challenger.epsilon,
-                    }
-                )
-                self._explored[env_idx] = 0
-                self._episode_ended = True
-                self.n_episodes += 1
+        for info in self.locals["infos"]:
+            for counted in (self._actions, self._recent):
+                counted[0] += 1
+                counted[1] += EXECUTED_ACTION in info
+            self._episode_ended |= "episode" in info
         return True
 
     def _on_rollout_end(self) -> None:
         with self.challenger.stopwatch.section("bookkeeping"):
             for episode, proposal in self.challenger.proposals:
                 self.n_proposals += 1
-                self._tables["proposals"].add({"step": self.num_timesteps, **_proposal_row(episode, proposal)})
+                self._tables["proposals"].add_row({"step": self.num_timesteps, **_proposal_row(episode, proposal)})
                 self._capture(episode, proposal)
             if self._episode_ended:
-                self._tables["coefficients"].add(self._coefficients())
+                self._tables["coefficients"].add_row(self._coefficients())
+                self._recent = [0, 0]
                 self._episode_ended = False
 
     def _coefficients(self) -> dict[str, Any]:
@@ -169,6 +151,7 @@ class Recorder(BaseCallback):
         return {
             "step": self.num_timesteps,
             "epsilon": self.challenger.epsilon,
+            "explored_share": self._recent[1] / max(self._recent[0], 1),
             **buffer.coefficients,
             # the scale k before the exponential function belongs to the default estimator; others may have none
             "k": _number(getattr(getattr(challenger, "uncertainty", None), "k", None)),
@@ -222,10 +205,6 @@ def _channels_last(frames: np.ndarray, space: spaces.Space) -> np.ndarray:
 
 def _number(value: Any) -> float:
     return float("nan") if value is None else float(value)
-
-
-def _optional_int(value: Any) -> int | None:
-    return None if value is None else int(value)
 
 
 def _spread(shots: Sequence[Shot], n: int) -> list[Shot]:

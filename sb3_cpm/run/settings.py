@@ -1,101 +1,93 @@
-"""What a run is made of: plain data that is written into the run folder, so that the run can be repeated."""
+"""What the command line of ``train`` takes: which agent on which task, and what of it is to be different."""
 
 import re
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-ALGORITHMS = ("sac", "td3", "tqc")
-#: Evaluation seeds start here; training has those below.
-FIRST_SEED = 1_000_000
-
-#: What differs from the defaults below, for tasks that the package knows.
-TASK_DEFAULTS: dict[str, dict[str, Any]] = {
-    "PickCube-v1": {
-        "steps": 5000,
-        "gamma": 0.8,
-        "tau": 0.01,
-        "ent_coef": "auto_0.01",
-        # an episode goes on after success: else, with rewards above zero, hovering beside the goal pays more than success
-        "env_kwargs": {"ignore_terminations": True},
-    },
-    "CPMToy-v0": {"steps": 2000, "gamma": 0.9, "tau": 0.01},
+#: Settings that the agent's file has entries for, under the same names.
+_HYPERPARAMETERS = (
+    *("n_envs", "buffer_size", "batch_size", "learning_rate", "gamma", "tau", "ent_coef", "train_freq", "gradient_steps"),
+    "learning_starts",
+)
+#: Settings that are arguments of :class:`~sb3_cpm.callbacks.ChallengerCallback`, and their names there.
+_CALLBACK = {
+    **{name: name for name in ("preset", "decay", "unit")},
+    "challenger_train_freq": "train_freq",
+    "challenger_gradient_steps": "gradient_steps",
 }
-
-
-def check_seed(seed: int, n_envs: int) -> None:
-    """:raises ValueError: for a seed of a run some of whose environments would have seeds of the evaluation"""
-    if not 0 <= seed < FIRST_SEED - n_envs:
-        raise ValueError(
-            f"seed={seed}: expected 0 or more, and less than {FIRST_SEED - n_envs}: the evaluation's episodes have the seeds "
-            "from there on, and training never sees these"
-        )
+#: What a resumed run may be given.
+WITH_RESUME = ("resume", "device", "threads", "video", "progress_bar")
 
 
 @dataclass(frozen=True)
 class TrainSettings:
     """
-    Settings of :func:`~sb3_cpm.run.training.train`.
+    Settings of :func:`~sb3_cpm.run.training.train`. Those without a default take what the agent's file in ``zoo_configs/`` has
+    for the task; those that are given win over it.
 
-    :param env: a ManiSkill task, ``CPMToy-v0``, or any gymnasium id with continuous actions; ``MODULE:ID`` imports first what
-        registers it
-    :param steps: environment steps to train for, over all environments; None: the task's own number, else 10000
+    :param env: a task: ``CPM/PickCube-v1`` (or shorter ``PickCube-v1``), ``CPMToy-v0``, any gymnasium id with continuous
+        actions, or ``MODULE:ID``, which imports first what registers it
+    :param agent: what learns: the name of a file in ``zoo_configs/``, or the path of one
+    :param steps: environment steps to train for, over all environments
     :param seed: rules the whole run; below 1000000, where the seeds of the evaluation begin
     :param run_folder: where the results go; None: the next free name below ``runs/``
+    :param resume: the folder of a run that was cut off, which goes on from its newest checkpoint
     :param n_envs: parallel environments, in processes of their own when more than one
-    :param algorithm: the player: ``"sac"``, ``"td3"`` or ``"tqc"`` (needs sb3-contrib)
     :param preset: sizes of the challenger, see :mod:`sb3_cpm.presets`
     :param decay: how the exploration probability falls, see :func:`~sb3_cpm.exploration.make_decay`
     :param unit: who acts is drawn per ``"step"``, ``"segment"`` or ``"episode"``
     :param challenge_ratio: share of the player's batches that come from challenges
-    :param buffer_size: transitions that D holds; None: all of the run, 20000 at most, or two episodes of each environment if
-        that is more
+    :param buffer_size: transitions that D holds
     :param batch_size: of the player
     :param learning_rate: of the player
-    :param gamma: discount factor of the player; None: the task's own, else 0.99
-    :param tau: soft update of the player's target networks; None: the task's own, else 0.005
-    :param ent_coef: entropy coefficient of SAC and TQC; None: the task's own, else "auto_0.05". The rewards of normalized
-        tasks are small: beside SB3's first value of 1 a short run would see nothing but entropy
+    :param gamma: discount factor of the player
+    :param tau: soft update of the player's target networks
+    :param ent_coef: entropy coefficient of SAC and TQC
     :param train_freq: environment steps between two updates of the player
     :param gradient_steps: updates then
-    :param learning_starts: steps before the first update; None: four episodes, or half of the run if that is less and an
-        episode fits in
+    :param learning_starts: steps before the first update
     :param challenger_train_freq: environment steps between two updates of the challenger
     :param challenger_gradient_steps: updates then
     :param evaluations: how often the deterministic player is evaluated, start and end included; 0 for never
     :param eval_episodes: episodes of each evaluation, always with the same seeds, which training never uses
+    :param checkpoint_freq: environment steps between two checkpoints, from which a run that was cut off goes on. Each begins
+        new episodes: best is a multiple of an episode's length times the number of environments
     :param video: film an episode at the end
     :param device: PyTorch device
     :param threads: of torch on the CPU; more than one rarely pays at these sizes
     :param progress_bar: None: where the terminal can show one
     :param env_kwargs: arguments of the environment
-    :param model_kwargs: further arguments of the SB3 algorithm
+    :param model_kwargs: further entries of the agent, such as arguments of the SB3 algorithm
     :param buffer_kwargs: further arguments of ``CPMBuffer``
     :param callback_kwargs: further arguments of ``ChallengerCallback``
+    :raises ValueError: for values that cannot work
     """
 
-    env: str = "PickCube-v1"
+    env: str = "CPM/PickCube-v1"
+    agent: str = "cpm_sac"
     steps: int | None = None
     seed: int = 0
     run_folder: str | None = None
-    n_envs: int = 1
-    algorithm: str = "sac"
-    preset: str = "default"
-    decay: str = "linear"
-    unit: str = "segment"
-    challenge_ratio: float = 0.25
+    resume: str | None = None
+    n_envs: int | None = None
+    preset: str | None = None
+    decay: str | None = None
+    unit: str | None = None
+    challenge_ratio: float | None = None
     buffer_size: int | None = None
-    batch_size: int = 64
-    learning_rate: float = 3e-4
+    batch_size: int | None = None
+    learning_rate: float | None = None
     gamma: float | None = None
     tau: float | None = None
     ent_coef: str | None = None
-    train_freq: int = 1
-    gradient_steps: int = 1
+    train_freq: int | None = None
+    gradient_steps: int | None = None
     learning_starts: int | None = None
-    challenger_train_freq: int = 8
-    challenger_gradient_steps: int = 1
+    challenger_train_freq: int | None = None
+    challenger_gradient_steps: int | None = None
     evaluations: int = 6
     eval_episodes: int = 5
+    checkpoint_freq: int = 1000
     video: bool = True
     device: str = "auto"
     threads: int = 1
@@ -106,37 +98,53 @@ class TrainSettings:
     callback_kwargs: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.algorithm not in ALGORITHMS:
-            raise ValueError(f"algorithm={self.algorithm!r}: expected one of {ALGORITHMS}")
-        for name in ("n_envs", "batch_size", "train_freq", "challenger_train_freq", "threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: expected 1 or more")
-        check_seed(self.seed, self.n_envs)
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps={self.steps}: expected 1 or more")
-        if self.evaluations < 0 or (self.evaluations and self.eval_episodes < 1):
+        for name in ("steps", "n_envs", "batch_size", "train_freq", "challenger_train_freq", "checkpoint_freq", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}={value}: expected 1 or more")
+        if self.seed < 0:
+            raise ValueError(f"seed={self.seed}: expected 0 or more")
+        if self.evaluations < 0 or self.evaluations == 1 or (self.evaluations and self.eval_episodes < 1):
             raise ValueError(
-                f"evaluations={self.evaluations} with eval_episodes={self.eval_episodes}: expected at least one episode each, "
-                "or evaluations=0 for none"
+                f"evaluations={self.evaluations} with eval_episodes={self.eval_episodes}: expected two evaluations or more, "
+                "at the start and at the end, of at least one episode each, or evaluations=0 for none"
             )
+        if self.resume is not None:
+            changed = [one.name for one in fields(self) if getattr(self, one.name) != _default(one)]
+            others = [name for name in changed if name not in WITH_RESUME]
+            if others:
+                raise ValueError(
+                    f"resume={self.resume!r} goes on with that run as it is, but {', '.join(others)} came with it. Expected "
+                    f"beside it only {', '.join(WITH_RESUME[1:])}: leave the others out, or begin a new run with them"
+                )
 
-    def resolved(self) -> "TrainSettings":
-        """:return: the same with the task's own defaults in place of None"""
-        task = TASK_DEFAULTS.get(self.env.rpartition(":")[2], {})
-        own = {name: value for name, value in task.items() if name != "env_kwargs" and getattr(self, name) is None}
-        settings = replace(self, **own, env_kwargs={**task.get("env_kwargs", {}), **self.env_kwargs})
-        steps = settings.steps or 10_000
-        return replace(
-            settings,
-            steps=steps,
-            gamma=0.99 if settings.gamma is None else settings.gamma,
-            tau=0.005 if settings.tau is None else settings.tau,
-            ent_coef="auto_0.05" if settings.ent_coef is None else settings.ent_coef,
-        )
+    def overrides(self) -> dict[str, Any]:
+        """:return: entries that win over those of the agent's file"""
+        entries: dict[str, Any] = {name: getattr(self, name) for name in _HYPERPARAMETERS if getattr(self, name) is not None}
+        coefficient = entries.get("ent_coef")
+        if coefficient is not None and not coefficient.startswith("auto"):
+            entries["ent_coef"] = float(coefficient)
+        entries.update(self.model_kwargs)
+        buffer = {} if self.challenge_ratio is None else {"challenge_ratio": self.challenge_ratio}
+        callback = {theirs: getattr(self, ours) for ours, theirs in _CALLBACK.items() if getattr(self, ours) is not None}
+        nested = {
+            "env_kwargs": self.env_kwargs,
+            "replay_buffer_kwargs": {**buffer, **self.buffer_kwargs},
+            "callback": _of_challenger({**callback, **self.callback_kwargs}),
+        }
+        return {**entries, **{name: arguments for name, arguments in nested.items() if arguments}}
 
     def as_dict(self) -> dict[str, Any]:
-        """:return: plain data, for config.yml"""
-        return asdict(self)
+        """:return: the settings by name"""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+
+def _of_challenger(arguments: dict[str, Any]) -> dict[str, Any]:
+    return {"sb3_cpm.ChallengerCallback": arguments} if arguments else {}
+
+
+def _default(setting: Any) -> Any:
+    return setting.default_factory() if callable(setting.default_factory) else setting.default
 
 
 def field_documentation() -> dict[str, str]:
@@ -148,6 +156,8 @@ def field_documentation() -> dict[str, str]:
         if text.startswith(":param "):
             name, _, text = text.removeprefix(":param ").partition(": ")
             documentation[name] = text
+        elif text.startswith(":raises"):
+            name = ""
         elif name and text:
             documentation[name] += " " + text
     known = {setting.name for setting in fields(TrainSettings)}

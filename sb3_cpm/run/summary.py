@@ -5,8 +5,12 @@ import resource
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from sb3_cpm.files import write_text
+from sb3_cpm.run.tables import read_csv
 
 #: Rows of the time table in this order, where there are such; all other sections of the stopwatch follow.
 SECTIONS = (
@@ -129,6 +133,36 @@ class Summary:
         console.print(facts)
         console.print(times)
         console.print(f"Everything is in {self.folder}", soft_wrap=True)
+
+
+class Evaluated(NamedTuple):
+    """
+    One evaluation.
+
+    :param mean_return: over its episodes, None where there was no evaluation
+    :param success: share of them that were a success at their end, None where the environment doesn't say
+    """
+
+    mean_return: float | None
+    success: float | None
+
+
+def evaluated(folder: Path) -> tuple[Evaluated, Evaluated]:
+    """
+    :param folder: of a run
+    :return: its first and its last evaluation
+    """
+    table = read_csv(folder / "evaluations.csv")
+    if not table or len(table["step"]) == 0:
+        return Evaluated(None, None), Evaluated(None, None)
+    first, last = (table["step"] == step for step in (table["step"].min(), table["step"].max()))
+    return _evaluated(table, first), _evaluated(table, last)
+
+
+def _evaluated(table: dict[str, np.ndarray], rows: np.ndarray) -> Evaluated:
+    told = table["success_at_end"][rows]
+    told = told[np.isfinite(told)]
+    return Evaluated(float(table["return"][rows].mean()), float(told.mean()) if len(told) else None)
 
 
 def complete_times(seconds: dict[str, float], total: float) -> dict[str, float]:

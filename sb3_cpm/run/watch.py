@@ -20,7 +20,7 @@ from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.files import write_bytes
 from sb3_cpm.run import watch_pictures as pictures
-from sb3_cpm.run.plots import read_csv
+from sb3_cpm.run.tables import read_diagnostics
 from sb3_cpm.type_aliases import Evaluation
 
 MOST_FRAMES = 64
@@ -193,15 +193,15 @@ def _write(folder: Path, challenger: Challenger, dreams: Sequence[Dream]) -> lis
             files.append(target / f"open_loop_{number}.gif")
             write_bytes(files[-1], pictures.animation(dream))
     files.append(target / "training.png")
-    pictures.draw_training(files[-1], read_csv(folder / "progress.csv"), title)
+    pictures.draw_training(files[-1], read_diagnostics(folder), title)
     _log(folder / "tensorboard" / "watch", challenger, dreams, files)
     return files
 
 
 def _title(folder: Path, challenger: Challenger) -> str:
     config = folder / "config.yml"
-    settings = yaml.safe_load(config.read_text(encoding="utf-8")) if config.is_file() else {}
-    env = (settings or {}).get("env", folder.name)
+    stored = yaml.safe_load(config.read_text(encoding="utf-8")) if config.is_file() else {}
+    env = ((stored or {}).get("run") or {}).get("env_id", folder.name)
     return f"World model of {env} after {challenger.trained_updates} updates"
 
 

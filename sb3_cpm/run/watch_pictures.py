@@ -5,7 +5,7 @@ In all of them blue marks states that the model has seen before it draws them, o
 """
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -229,17 +229,16 @@ def _draw_progress(draw: ImageDraw.ImageDraw, dream: "Dream", row: int, box: tup
 # ---------------------------------------------------------------------- how it learnt
 
 
-def draw_training(path: Path, progress: dict[str, np.ndarray], title: str) -> None:
+def draw_training(path: Path, diagnostics: Mapping[str, tuple[np.ndarray, np.ndarray]], title: str) -> None:
     """
     Reconstruction error per key, KL, ensemble spread and its scale, over the run.
 
     :param path: the PNG to write
-    :param progress: columns of progress.csv
+    :param diagnostics: steps and values of what was logged, by name
     :param title: what was trained
     """
     prefix = "challenger/"
-    known = {name.removeprefix(prefix): values for name, values in progress.items() if name.startswith(prefix)}
-    steps = progress.get("time/total_timesteps", np.zeros(0))
+    known = {name.removeprefix(prefix): logged for name, logged in diagnostics.items() if name.startswith(prefix)}
     errors = [name for name in known if name.startswith("error_")] or [name for name in known if name == "pixel_error"]
     losses: list[str] = [name for name in ("image_loss", "vector_loss", "reward_loss", "continue_loss") if name in known]
     panels: list[tuple[str, list[str], bool]] = [
@@ -252,15 +251,15 @@ def draw_training(path: Path, progress: dict[str, np.ndarray], title: str) -> No
         figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 7.5), sharex=True, layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=13)
         for axis, (name, columns, log) in zip(axes.flat, panels, strict=True):
-            _draw_columns(axis, steps, {column: known[column] for column in columns if column in known}, log)
+            _draw_columns(axis, {column: known[column] for column in columns if column in known}, log)
             axis.set_title(name)
         for axis in axes[-1]:
             axis.set_xlabel("environment steps")
         save_figure(figure, path)
 
 
-def _draw_columns(axis: Axes, steps: np.ndarray, columns: dict[str, np.ndarray], log: bool) -> None:
-    for colour, (name, values) in zip(COLOURS, columns.items(), strict=False):
+def _draw_columns(axis: Axes, columns: dict[str, tuple[np.ndarray, np.ndarray]], log: bool) -> None:
+    for colour, (name, (steps, values)) in zip(COLOURS, columns.items(), strict=False):
         told = np.isfinite(values)
         axis.plot(steps[told], values[told], color=colour, alpha=0.3, lw=1)
         mean = running_mean(values[told], max(1, int(told.sum()) // 20))

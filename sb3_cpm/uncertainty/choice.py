@@ -33,16 +33,17 @@ def check_uncertainties(preset: Preset) -> None:
 
 
 def choose_uncertainty(
-    kind: str | type[Uncertainty], kwargs: Mapping[str, Any] | None, preset: Preset
+    kind: str | type[Uncertainty] | None, kwargs: Mapping[str, Any] | None, preset: Preset
 ) -> tuple[str, type[Uncertainty], dict[str, Any]]:
     """
-    :param kind: ``uncertainty_class`` of :class:`~sb3_cpm.challenger.Challenger`
+    :param kind: ``uncertainty_class`` of :class:`~sb3_cpm.challenger.Challenger`; None: the preset's
     :param kwargs: ``uncertainty_kwargs``
     :param preset: has arguments of them
     :return: its name in checkpoints, the class, and its arguments: the preset's with ``kwargs`` on top
     :raises ValueError: for names that there are not, with the nearest, also of arguments in the preset
     """
     check_uncertainties(preset)
+    kind = preset.uncertainty_class if kind is None else kind
     if isinstance(kind, str):
         if kind not in UNCERTAINTY_CLASSES:
             raise ValueError(

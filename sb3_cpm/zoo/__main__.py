@@ -95,7 +95,8 @@ def complete(command: str, arguments: Sequence[str]) -> list[str]:
     :return: the same with what rl_zoo3 needs in place of what we allow, ``--option=value`` as two
     :raises ValueError: for an agent that does not exist
     """
-    from sb3_cpm.zoo.agents import algorithm_of, find_config
+    from sb3_cpm.agents.algorithms import algorithm_of
+    from sb3_cpm.agents.configs import find_config
 
     completed = [part for argument in arguments for part in (argument.split("=", 1) if argument[:2] == "--" else [argument])]
     if "--agent" in completed:

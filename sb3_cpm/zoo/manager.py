@@ -2,9 +2,9 @@
 Four methods of rl_zoo3's ``ExperimentManager``, wrapped: what they did, they do, and then some.
 
 ==========================  ==============================================================================================
-``read_hyperparameters``    also names misspelt keys, before anything is built (:mod:`sb3_cpm.zoo.checks`), and puts our part
-                            of a trial (``--trial-id``) where it belongs (:mod:`sb3_cpm.zoo.search`); evaluation environments
-                            get the ``env_kwargs`` of the configuration, as training environments do
+``read_hyperparameters``    also names misspelt keys, before anything is built (:mod:`sb3_cpm.agents.checks`), and puts our
+                            part of a trial (``--trial-id``) where it belongs (:mod:`sb3_cpm.zoo.search`); evaluation
+                            environments get the ``env_kwargs`` of the configuration, as training environments do
 ``_load_pretrained_agent``  also names the file where a replay buffer is damaged (:mod:`sb3_cpm.zoo.resume`)
 ``learn``                   also saves the challenger, and goes on where the run stopped with ``-i`` (likewise)
 ``objective``               also samples our arguments with ``--optimize`` (:mod:`sb3_cpm.zoo.search`)
@@ -15,7 +15,9 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from sb3_cpm.zoo import checks, resume, search
+from sb3_cpm.agents.checks import check_hyperparameters
+from sb3_cpm.agents.configs import check_environment_names
+from sb3_cpm.zoo import resume, search
 
 
 def install() -> None:
@@ -36,14 +38,14 @@ def install() -> None:
 
 def _reading(original: Callable[..., Any]) -> Callable[..., Any]:
     def read_hyperparameters(manager: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        checks.check_environment_names(manager.config, manager.env_name.gym_id)
+        check_environment_names(manager.config, manager.env_name.gym_id)
         configured = search.without_trial(original, manager)
         hyperparameters, _ = original(manager)
         if configured is not None:
             hyperparameters = search.with_trial(hyperparameters, configured, manager.custom_hyperparams or {})
         if manager._eval_env_kwargs_args is None and "env_kwargs" in hyperparameters:
             manager.eval_env_kwargs = hyperparameters["env_kwargs"]  # rl_zoo3 gives them to the training environments only
-        checks.check_hyperparameters(hyperparameters, manager.algo, manager.env_name.gym_id, manager.config)
+        check_hyperparameters(hyperparameters, manager.algo, manager.env_name.gym_id, manager.config)
         return hyperparameters, dict(sorted(hyperparameters.items()))
 
     return read_hyperparameters

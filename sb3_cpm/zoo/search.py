@@ -14,8 +14,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+from sb3_cpm.agents.algorithms import evaluated
+from sb3_cpm.agents.checks import named_with_arguments
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.zoo.checks import named_with_arguments
 
 #: Key under which the converter hands our part of a trial to :func:`with_trial`.
 OURS = "cpm_trial"
@@ -114,19 +115,8 @@ def _setting_ours_apart(convert: Callable[..., dict[str, Any]]) -> Callable[...,
 def _with_policy_kwargs(sampled: dict[str, Any], configured: Mapping[str, Any]) -> dict[str, Any]:
     if "policy_kwargs" not in sampled:
         return sampled
-    return {**sampled, "policy_kwargs": {**evaluated(configured.get("policy_kwargs")), **sampled["policy_kwargs"]}}
-
-
-def evaluated(kwargs: Any) -> dict[str, Any]:
-    """
-    :param kwargs: a mapping, a string that rl_zoo3 would evaluate to one, or None
-    :return: the mapping
-    """
-    if isinstance(kwargs, str):
-        from rl_zoo3 import exp_manager
-
-        kwargs = eval(kwargs, vars(exp_manager))  # as rl_zoo3 does
-    return dict(kwargs or {})
+    before = evaluated(configured.get("policy_kwargs"), "policy_kwargs") or {}
+    return {**sampled, "policy_kwargs": {**before, **sampled["policy_kwargs"]}}
 
 
 @contextlib.contextmanager
@@ -199,7 +189,8 @@ def applied(values: Mapping[str, Any], hyperparameters: Mapping[str, Any]) -> di
     of_buffer = {BUFFER_SPACE[name].place: value for name, value in values.items() if name in BUFFER_SPACE}
     of_callback = {CALLBACK_SPACE[name].place: value for name, value in values.items() if name in CALLBACK_SPACE}
     if of_buffer:
-        result["replay_buffer_kwargs"] = _placed(evaluated(result.get("replay_buffer_kwargs")), of_buffer)
+        before = evaluated(result.get("replay_buffer_kwargs"), "replay_buffer_kwargs") or {}
+        result["replay_buffer_kwargs"] = _placed(before, of_buffer)
     index = _challenger_index(result.get("callback"))
     if of_callback and index is not None:
         callbacks = [{path: kwargs} for path, kwargs in named_with_arguments(result["callback"])]

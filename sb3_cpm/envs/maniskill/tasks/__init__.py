@@ -35,6 +35,15 @@ def register_report_tasks() -> None:
     from sb3_cpm.envs.maniskill.tasks import lift_cube, pick_single_egad, turn_faucet  # noqa: F401
 
 
+def knows_task(name: str) -> bool:
+    """:return: whether there is a task of that name, of ManiSkill's or ours"""
+    import mani_skill.envs  # noqa: F401  # registers them
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    register_report_tasks()
+    return name in REGISTERED_ENVS
+
+
 def registered_name(env_id: str, reward_mode: str) -> str:
     """
     :param env_id: the task that is asked for

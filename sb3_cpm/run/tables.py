@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sb3_cpm.files import GrowingFile
 
 EVALUATIONS = (
@@ -63,6 +65,63 @@ class Table:
     def close(self) -> None:
         """:raises NotWrittenError: if rows are still missing on the disk"""
         self._file.close()
+
+
+class GrownTable(Table):
+    """
+    A table whose columns are those of its first row, or of the rows that a resumed run keeps.
+
+    :param path: of the file
+    :param size: bytes to keep of a file that is there already
+    :param digest: SHA-256 of these; None: they are believed
+    :raises DamagedFileError: if the file has fewer, or others
+    """
+
+    def __init__(self, path: Path, size: int = 0, digest: str | None = None) -> None:
+        self.path = path
+        self._file = GrowingFile(path, size, digest)
+        self.columns = tuple(path.read_text(encoding="utf-8").partition("\n")[0].strip().split(",")) if size else ()
+
+    def add_row(self, row: dict[str, Any]) -> None:
+        """:param row: by column"""
+        if not self.columns:
+            self.columns = tuple(row)
+            self._write(self.columns)
+        self.add([row[column] for column in self.columns])
+
+
+def read_csv(path: Path) -> dict[str, np.ndarray]:
+    """
+    :param path: a table
+    :return: one array per column, of numbers with nan where a cell is empty, or of texts; no columns where the file is missing
+        or empty
+    """
+    if not path.exists():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        names = reader.fieldnames or []  # reads the first line if nobody has: not after the file is closed
+        rows = list(reader)
+    return {name: _column([row[name] for row in rows]) for name in names}
+
+
+def _column(cells: list[str]) -> np.ndarray:
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError:
+        return np.array(cells)
+
+
+def read_diagnostics(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """
+    :param folder: of a run
+    :return: steps and values of everything that was logged, by name
+    """
+    table = read_csv(folder / "diagnostics.csv")
+    if not table:
+        return {}
+    chosen = {name: table["name"] == name for name in np.unique(table["name"])}
+    return {str(name): (table["step"][rows], table["value"][rows]) for name, rows in chosen.items()}
 
 
 def _cell(value: Any) -> Any:

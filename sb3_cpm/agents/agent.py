@@ -10,8 +10,10 @@ overridden in depth, and nothing is written.
 import argparse
 import contextlib
 import copy
+import functools
 import io
-from collections.abc import Callable, Mapping
+import signal
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,11 +21,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_cpm.arguments import nearest
-from sb3_cpm.envs.suites import register_suite
-from sb3_cpm.zoo.checks import algorithms, check_hyperparameters, find_entry, read_entries
+from sb3_cpm.agents.algorithms import add_names, algorithm_of, algorithms
+from sb3_cpm.agents.checks import check_hyperparameters
+from sb3_cpm.agents.configs import find_config, find_entry, merge, read_entries
+from sb3_cpm.agents.tasks import can_render, ensure_registered
+from sb3_cpm.envs.robust import RobustSubprocVecEnv
 
 
 class Built(NamedTuple):
@@ -33,13 +38,14 @@ class Built(NamedTuple):
     :param model: the SB3 model
     :param callbacks: those of the configuration, in its order; empty where it names none
     :param env: the training environments of the model
-    :param make_eval_env: makes one further environment with the same wrappers, in a VecEnv of its own
+    :param make_eval_env: makes one further environment with the same wrappers, in a ``DummyVecEnv`` of its own; with
+        ``render=True`` one that gives pictures, where it can
     """
 
     model: BaseAlgorithm
     callbacks: list[BaseCallback]
     env: VecEnv
-    make_eval_env: Callable[[], VecEnv]
+    make_eval_env: Callable[..., VecEnv]
 
 
 @dataclass(frozen=True)
@@ -84,12 +90,15 @@ class Agent:
         :param seed: rules model and environments
         :param n_envs: parallel environments; None: as the configuration says
         :param device: PyTorch device
-        :param vec_env_type: ``"dummy"`` or ``"subproc"``
+        :param vec_env_type: ``"dummy"``, ``"subproc"``, or ``"robust"``: in processes of their own, of which one that dies is
+            replaced
         :param load_path: go on with this saved model instead of making a new one
         :return: model, callbacks and environments
         :raises ValueError: where the algorithm, a wrapper or the environment refuses its arguments
         """
-        manager, hyperparameters = self._manager(seed, device, vec_env_type)
+        manager, hyperparameters = self._manager(seed, device, "dummy" if vec_env_type == "robust" else vec_env_type)
+        if vec_env_type == "robust":
+            manager.vec_env_class = functools.partial(_robust, seed)
         env = _quietly(manager.create_envs, n_envs or manager.n_envs, no_log=True)
         try:
             hyperparameters = _quietly(manager._preprocess_action_noise, hyperparameters, {}, env)
@@ -102,13 +111,17 @@ class Agent:
             env.close()
             raise
 
-        def make_eval_env() -> VecEnv:
+        def make_eval_env(render: bool = False) -> VecEnv:
+            manager.vec_env_class = DummyVecEnv
+            if render and can_render(self.env_id):
+                manager.eval_env_kwargs = {**manager.eval_env_kwargs, "render_mode": "rgb_array"}
             return _quietly(manager.create_envs, 1, eval_env=True, no_log=True)
 
         return Built(model, manager.callbacks, env, make_eval_env)
 
     def _manager(self, seed: int, device: str, vec_env_type: str) -> tuple[Any, dict[str, Any]]:
         """rl_zoo3's manager, and the arguments of the algorithm as it has read them."""
+        add_names()
         from rl_zoo3 import exp_manager
 
         manager = _quietly(
@@ -152,85 +165,21 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     return Agent(path.stem, algo, env_id, merged, path)
 
 
-# ---------------------------------------------------------------------- names
-
-
-def config_folder() -> Path:
+def _robust(seed: int, makers: Sequence[Callable[[], gym.Env]], **kwargs: Any) -> VecEnv:
     """
-    :return: ``zoo_configs/`` of the checkout that this package is in, or else of the working directory
-    :raises ValueError: where there is none
+    :param seed: of the run
+    :param makers: of the environments
+    :param kwargs: of the class
+    :return: them in processes of their own
     """
-    candidates = [Path(__file__).resolve().parents[2] / "zoo_configs", Path.cwd() / "zoo_configs"]
-    for folder in candidates:
-        if folder.is_dir():
-            return folder
-    raise ValueError(f"No folder zoo_configs, neither in {candidates[0].parent} nor here: give the path of a file.")
+    seeded = [functools.partial(_in_a_worker, make, seed + rank) for rank, make in enumerate(makers)]
+    return RobustSubprocVecEnv(seeded, **kwargs)
 
 
-def find_config(name_or_path: str | Path) -> Path:
-    """
-    :param name_or_path: a name in ``zoo_configs/``, or a path
-    :return: the file
-    :raises ValueError: if there is none, with the nearest name
-    """
-    given = Path(name_or_path)
-    if given.suffix in (".yml", ".yaml"):
-        if given.is_file():
-            return given
-        raise ValueError(f"There is no file {given}.")
-    folder = config_folder()
-    names = sorted(path.stem for path in folder.glob("*.yml"))
-    if str(name_or_path) not in names:
-        raise ValueError(f"Unknown agent {str(name_or_path)!r}.{nearest(str(name_or_path), names)} Known: {', '.join(names)}.")
-    return folder / f"{name_or_path}.yml"
-
-
-def algorithm_of(name: str) -> str:
-    """
-    The algorithm that a file is for: the one that is a part of its name.
-
-    >>> algorithm_of("cpm_sac_report")
-    'sac'
-
-    :raises ValueError: if no part is one
-    """
-    known = algorithms()
-    padded = f"_{name}_"
-    matches = [algo for algo in known if f"_{algo}_" in padded]
-    if not matches:
-        raise ValueError(f"The name {name!r} contains no algorithm (one of {', '.join(known)}): rename the file, my_sac.yml.")
-    return max(matches, key=len)  # ppo_lstm, not ppo
-
-
-def ensure_registered(env_id: str) -> None:
-    """
-    Import what registers an environment, if it is one that a known package brings.
-
-    :raises ValueError: if gymnasium does not know it, with the nearest name
-    """
-    register_suite(env_id)
-    if env_id not in gym.registry:
-        raise ValueError(f"Unknown environment {env_id!r}.{nearest(env_id, list(gym.registry))}")
-
-
-# ---------------------------------------------------------------------- reading
-
-
-def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    :param base: is not changed
-    :param overrides: dicts are merged entry by entry, everything else replaces; None removes
-    :return: both
-    """
-    result = copy.deepcopy(dict(base))
-    for key, value in overrides.items():
-        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
-            result[key] = merge(result[key], value)
-        elif value is None:
-            result.pop(key, None)
-        else:
-            result[key] = copy.deepcopy(value)
-    return result
+def _in_a_worker(make: Callable[[], gym.Env], seed: int) -> gym.Env:
+    set_random_seed(seed)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the main one ends this one
+    return make()
 
 
 def _quietly(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

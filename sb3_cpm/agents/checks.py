@@ -7,20 +7,19 @@ policy and features extractor, and those within ours (presets, uncertainty, deca
 and names of environments that do not exist.
 """
 
-import difflib
 import importlib
 import inspect
 import re
-import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_cpm.agents.algorithms import algorithms, evaluated
+from sb3_cpm.agents.tasks import NAMESPACE
 from sb3_cpm.arguments import (
     AT_LEAST_0,
     SHARE,
@@ -29,10 +28,10 @@ from sb3_cpm.arguments import (
     check,
     check_arguments,
     check_names,
+    error_prefix,
     integer,
     nearest,
     number,
-    told_where,
 )
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
@@ -41,13 +40,8 @@ from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
-from sb3_cpm.extras import needed
 from sb3_cpm.presets import make_preset
 from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
-from sb3_cpm.zoo.registration import ENV_IDS, NAMESPACE
-
-with needed("Configurations", "zoo"):
-    import yaml
 
 #: Keys that rl_zoo3 takes for itself; all others go to the constructor of the algorithm.
 ZOO_KEYS = (
@@ -84,78 +78,6 @@ EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")
 SET_FOR_POLICIES = ("observation_space", "action_space", "lr_schedule")
 
 
-def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """:return: rl_zoo3's algorithms by name, ours included"""
-    with needed("Configurations", "zoo"):
-        from rl_zoo3.utils import ALGOS
-
-    return ALGOS
-
-
-def read_entries(path: Path) -> dict[str, Any]:
-    """
-    :param path: a YAML file
-    :return: hyperparameters by environment
-    :raises ValueError: if it is no such file, or names a task of ours that does not exist
-    """
-    try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
-    if not isinstance(entries, dict):
-        raise ValueError(f"{path}: expected hyperparameters by environment, got {type(entries).__name__}.")
-    for name in map(str, entries):
-        if name.startswith(NAMESPACE) and name not in ENV_IDS:
-            raise ValueError(f"{path}: there is no environment {name!r}.{nearest(name, ENV_IDS)}")
-    return entries
-
-
-def check_environment_names(config: str, env_id: str) -> None:
-    """
-    :param config: what rl_zoo3 was given as ``--conf-file``; only YAML files are looked at
-    :param env_id: the environment that is asked for
-    :raises ValueError: see :func:`read_entries`; and if the environment is not in the file and there is no default for it
-    """
-    path = Path(config)
-    if path.suffix not in (".yml", ".yaml"):
-        return
-    if not path.is_file():
-        raise ValueError(f"There is no file {path}: name one with --conf-file.")
-    find_entry(read_entries(path), env_id, path)
-
-
-def find_entry(entries: Mapping[str, Any], env_id: str, path: Path) -> dict[str, Any]:
-    """
-    :param entries: of the file
-    :param env_id: the environment that is asked for
-    :param path: of the file
-    :return: the environment's entry, or the one called "default"
-    :raises ValueError: if there is none, or it is no mapping
-    """
-    if env_id not in entries and not {"default", "atari"} & set(entries):
-        others = ", ".join(map(repr, entries))
-        raise ValueError(f"{path} has neither an entry {env_id!r} nor a default.{nearest(env_id, entries)} It has {others}.")
-    if env_id not in entries:
-        _warn_of_slip(env_id, entries, path)
-    found = entries.get(env_id, entries.get("default", entries.get("atari")))
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: the entry of {env_id} must be a mapping of hyperparameters, got {found!r}.")
-    return found
-
-
-def _warn_of_slip(env_id: str, entries: Iterable[str], path: Path) -> None:
-    """A misspelt name in a file is passed over for the default without a word; another version's would not be a slip."""
-    name = env_id.rpartition("-v")[0]
-    others = {other.rpartition("-v")[0]: other for other in map(str, entries) if other not in gym.registry}
-    matches = difflib.get_close_matches(name, [other for other in others if other != name], n=1, cutoff=0.9)
-    if matches:  # no error: the entry may belong to a package that is not imported here
-        warnings.warn(
-            f"{path} has no entry for {env_id!r}, which gets the default. Its entry {others[matches[0]]!r} names no "
-            f"environment that is registered: did you mean {env_id!r}?",
-            stacklevel=4,
-        )
-
-
 def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id: str, path: str | Path) -> None:
     """
     :param hyperparameters: an entry of a file
@@ -174,12 +96,12 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
     _check_numbers(hyperparameters, where)
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
-        with told_where(f"{where}, {key}"):
+        with error_prefix(f"{where}, {key}"):
             named = named_with_arguments(hyperparameters.get(key))
         for name, kwargs in named:
             _check_made_of(_imported(name, f"{where}, {key}"), kwargs, f"{where}, {key} {name}")
     _check_buffer(hyperparameters, algorithm, where)
-    policy_kwargs = _evaluated(hyperparameters.get("policy_kwargs"), f"{where}, policy_kwargs")
+    policy_kwargs = evaluated(hyperparameters.get("policy_kwargs"), f"{where}, policy_kwargs")
     _check_policy_kwargs(policy_kwargs, _policy(hyperparameters["policy"], algo, where), f"{where}, policy_kwargs")
     if issubclass(algorithm, DreamerAlgorithm):
         _check_world_model({**hyperparameters, **(policy_kwargs or {})}, where)
@@ -248,14 +170,14 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
 def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
     check_arguments(where, kwargs, taker)
     if taker is ChallengerCallback:
-        with told_where(where):
+        with error_prefix(where):
             ChallengerCallback(**kwargs)  # checks its arguments, and makes nothing before learn()
 
 
 def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:
-    kind = _evaluated(hyperparameters.get("replay_buffer_class"), f"{where}, replay_buffer_class")
+    kind = evaluated(hyperparameters.get("replay_buffer_class"), f"{where}, replay_buffer_class")
     where = f"{where}, replay_buffer_kwargs"
-    kwargs = _evaluated(hyperparameters.get("replay_buffer_kwargs"), where) or {}
+    kwargs = evaluated(hyperparameters.get("replay_buffer_kwargs"), where) or {}
     if kind is None:
         kind = CPMBuffer if issubclass(algorithm, DreamerAlgorithm) else ReplayBuffer
     check_arguments(where, kwargs, kind, excluded=SET_BY_ALGORITHMS)
@@ -263,7 +185,7 @@ def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgori
         if issubclass(algorithm, OffPolicyAlgorithm) and (hyperparameters.get("n_steps") or 1) > 1:
             raise ValueError(f"{where}: {ONE_STEP}")
         arguments = {**_defaults(CPMBuffer), **kwargs}
-        with told_where(where):
+        with error_prefix(where):
             for part in (check_values, ChallengeCurator):
                 part(**{name: arguments[name] for name in inspect.signature(part).parameters})
 
@@ -313,7 +235,7 @@ def _defaults(taker: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _check_world_model(given: Mapping[str, Any], where: str) -> None:
-    with told_where(where):
+    with error_prefix(where):
         preset = make_preset(given.get("preset") or "default")
         # that of the one to start from is not known here
         kind = given.get("uncertainty_class") or (None if given.get("start_from") else "plan2explore")
@@ -350,16 +272,3 @@ def _imported(path: str, where: str) -> Callable[..., Any]:
     if not hasattr(module, name):
         raise ValueError(f"{where}: {module_name} has no {name!r}.{nearest(name, dir(module))}")
     return getattr(module, name)
-
-
-def _evaluated(value: Any, where: str) -> Any:
-    """:return: what rl_zoo3 makes of a value in whose place it allows Python, in a string"""
-    if not isinstance(value, str):
-        return value
-    from rl_zoo3 import exp_manager
-
-    try:
-        return eval(value, vars(exp_manager))
-    except Exception as error:  # it may be any Python
-        guess = nearest(error.name or "", vars(exp_manager)) if isinstance(error, NameError) else ""
-        raise ValueError(f"{where}: Python cannot evaluate {value!r} ({error}).{guess}") from error

@@ -4,7 +4,7 @@ from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
-from sb3_cpm.experiments.tables import Table
+from sb3_cpm.run.tables import Table
 
 
 class DiagnosticsWriter(KVWriter):

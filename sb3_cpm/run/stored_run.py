@@ -5,19 +5,15 @@ A file that was cut off, edited or lost would otherwise become a result like any
 """
 
 import io
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from sb3_cpm.experiments.run_folder import CONFIG, CRASHED, FINISHED, is_finished, read_yaml
-from sb3_cpm.experiments.specification import fingerprint
-from sb3_cpm.experiments.tables import COLUMNS
-
-
-class DamagedRunError(ValueError):
-    """The files of a run are not what a run leaves."""
+from sb3_cpm.files import DamagedRunError
+from sb3_cpm.run.folder import CONFIG, CRASHED, FINISHED, is_finished, read_yaml
+from sb3_cpm.run.specification import fingerprint
+from sb3_cpm.run.tables import COLUMNS
 
 
 class StoredRun(NamedTuple):
@@ -54,8 +50,6 @@ def read_run(folder: Path) -> StoredRun:
 
 
 def _read(folder: Path) -> StoredRun:
-    if not re.fullmatch(r"seed\d+", folder.name):
-        raise DamagedRunError("the folder of a run is called seedN")
     if not (folder / CONFIG).exists():
         raise DamagedRunError(f"there is no {CONFIG}")
     config = read_yaml(folder / CONFIG)

@@ -22,16 +22,24 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cpm.buffers import EpisodeBuffer
 from sb3_cpm.callbacks import ChallengerCallback
-from sb3_cpm.experiments.stored_run import DamagedRunError
-from sb3_cpm.files import Archive, DamagedFileError, disk_errors_named, verify, write_archive
+from sb3_cpm.files import (
+    Archive,
+    DamagedFileError,
+    DamagedRunError,
+    check_finite,
+    disk_errors_named,
+    verify,
+    write_archive,
+    write_sealed,
+)
 from sb3_cpm.packing import pack, unpack
-from sb3_cpm.run.evaluation import FIRST_SEED
-from sb3_cpm.run.folder import save_model
+from sb3_cpm.seeds import FIRST_SEED
 
 NAME = "checkpoint"
 MODEL, BUFFER, STATE = "model.zip", "replay_buffer.npz", "state.npz"
@@ -66,6 +74,20 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCall
             os.replace(current, old)
         os.replace(new, current)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def save_model(path: Path, model: BaseAlgorithm) -> None:
+    """
+    SB3's own archive, written whole, with a digest.
+
+    :param path: of the file
+    :param model: to save
+    :raises NotFiniteError: if a weight is not finite; the last good file stays
+    :raises NotWrittenError: if the disk does not take it; the last good file stays, too
+    """
+    _, variables = model._get_torch_save_params()
+    check_finite(path, "model", {name: recursive_getattr(model, name, None) for name in variables} | model.get_parameters())
+    write_sealed(path, model.save)
 
 
 def _write(new: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra: dict[str, Any]) -> None:
