@@ -106,7 +106,7 @@ def test_shares_that_exceed_one(mix):
 def test_rounded_shares_never_exceed_the_batch(challenges, demonstrations, batch_size):
     """Half a row more for each would be one too many."""
     buffer = make(mix="row", challenge_ratio=challenges, demonstration_ratio=demonstrations, warmup_steps=2)
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     buffer.add_demonstrations([demonstration(1, 4)])
     play(buffer, 10)
     episode = buffer.episodes[0]

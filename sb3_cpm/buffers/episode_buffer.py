@@ -84,9 +84,11 @@ class EpisodeBuffer(HerReplayBuffer):
         come from the environment's ``compute_reward``, see :class:`~sb3_cpm.buffers.CPMBuffer`
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
-    :param storage_dtypes: see :class:`~sb3_cpm.buffers.CPMBuffer`
-    :param memmap_dir: likewise
-    :param player_keys: likewise
+    :param storage_dtypes: compact storage of keys of floats, ``{"pointcloud": "float16"}``; ``("uint8", 0.0, 1.0)`` for
+        numbers between these bounds (without bounds: the space's), a list of such for one per feature of the last axis.
+        Batches hold the space's dtype as ever
+    :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
+    :param player_keys: observation keys that batches hold; None: all keys
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_cpm.challenger.log_names import short_names
 from sb3_cpm.presets import Preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty, checked_novelty
@@ -43,6 +44,7 @@ class Learner:
         self.world_model, self.uncertainty, self.behaviors = world_model, uncertainty, behaviors
         self.preset = preset
         self.updates = 0
+        self._log_names = {f"error_{key}": f"error_{name}" for key, name in short_names(world_model.spec.keys).items()}
         self.optimizers = self._make_optimizers()
         if preset.amp:
             check_mixed_precision(self.device)
@@ -96,7 +98,7 @@ class Learner:
             metrics.update(behavior.step(losses, self.optimizers))
         self.updates += 1
         values = th.stack([value.detach().to(th.float32) for value in metrics.values()]).tolist()  # one transfer
-        return dict(zip(metrics, values, strict=True))
+        return dict(zip((self._log_names.get(name, name) for name in metrics), values, strict=True))
 
     def _run(self, name: str, function: Callable[..., Any], *inputs: th.Tensor | None) -> Any:
         return function(*inputs) if self.graphs is None else self.graphs.run(name, function, *inputs)

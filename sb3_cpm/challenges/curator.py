@@ -58,8 +58,8 @@ class ChallengeCurator:
 
     :param warmup_steps: the first transitions of every trajectory that never count, because the latent state starts at
         zero and its surprise is meaningless [B.5.2]
-    :param kl_ratio: see :class:`~sb3_cpm.challenges.quality.ChallengeQuality`
-    :param reward_ratio: likewise; F1 uses it too
+    :param kl_ratio: target of mean(c1 * KL) over mean(DISAG), report: 0.1
+    :param reward_ratio: c*, target of mean(c * r) over mean(u), report: 0.75; F1 uses it too
     :param filter_kwargs: passed to :class:`~sb3_cpm.challenges.filters.ChallengeFilter`
     :param reward_kwargs: passed to :class:`~sb3_cpm.challenges.rewards.ArtificialReward`
     :param coefficient_kwargs: passed to every :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`

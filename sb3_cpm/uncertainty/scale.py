@@ -84,9 +84,9 @@ class ScaledUncertainty(Uncertainty):
 
     :param sizes: sizes of latents and actions
     :param metric: "exp" is exp(k * d) - 1 with a dynamic scale k, at least 0; "log" is log(d), negative for d < 1
-    :param mean_range: see :class:`ExpScale`
-    :param max_range: see :class:`ExpScale`
-    :param scale_factor: see :class:`ExpScale`
+    :param mean_range: tolerated mean of k * d over a batch
+    :param max_range: tolerated maximum of k * d over a batch; wide, so that one unknown region does not flatten all others
+    :param scale_factor: by which k moves in one step, 1.5 in the report
     :param exponent_limit: beyond it, exp goes on as a straight line with the same slope: it cannot overflow, and the order of
         transitions and the gradient survive
     :raises ValueError: for an unknown metric

@@ -2,7 +2,6 @@
 The world model: encoder, RSSM, decoders, reward head and continue head, trained together (report, B.1; Hafner et al. 2021).
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch as th
@@ -15,29 +14,6 @@ from sb3_cpm.world_model.losses import balanced_kl, masked_mean, squared_error
 from sb3_cpm.world_model.networks import MLP, Decoder, Encoder
 from sb3_cpm.world_model.observations import Inputs, ObservationSpec, symexp, symlog
 from sb3_cpm.world_model.rssm import RSSM, LatentState
-
-LONGEST_KEY = 27  # SB3 prints 36 characters of a name: 3 to indent it, "error_", and what is left
-
-
-def short_names(keys: Sequence[str]) -> dict[str, str]:
-    """
-    Names for the log that differ from each other also where SB3 prints only their beginning.
-
-    :param keys: of observations
-    :return: keys of up to ``LONGEST_KEY`` characters as they are, of longer ones beginning and end; where two would look the
-        same, numbers tell them apart
-    """
-    names = {key: key for key in keys if len(key) <= LONGEST_KEY}
-    for key in keys:
-        number = 1
-        while key not in names:
-            mark = "..." if number == 1 else f"..{number}.."
-            left = LONGEST_KEY - len(mark)
-            name = key[: left // 3] + mark + key[-(left - left // 3) :]
-            number += 1
-            if name not in names.values():
-                names[key] = name
-    return names
 
 
 class Sequences(NamedTuple):
@@ -96,8 +72,6 @@ class WorldModel(nn.Module):
     def __init__(self, spec: ObservationSpec, action_dim: int, preset: Preset) -> None:
         super().__init__()
         self.spec, self.action_dim, self.preset = spec, action_dim, preset
-        #: what the reconstruction error of each key is called in the log
-        self.error_names = {key: f"error_{name}" for key, name in short_names(spec.keys).items()}
         vector = (preset.vector_layers, preset.vector_units)
         cnn = (preset.cnn_depth, preset.cnn_layers)
         self.encoder = Encoder(spec, *cnn, *vector)
@@ -141,7 +115,7 @@ class WorldModel(nn.Module):
             losses["vector"] = masked_mean(squared_error(decoded.vectors, batch.inputs.vectors), mask)
         with th.no_grad():
             errors = {key: masked_mean(one, mask) for key, one in self.spec.errors(decoded, batch.inputs)}
-            metrics.update({self.error_names[key]: value for key, value in errors.items()})
+            metrics.update({f"error_{key}": value for key, value in errors.items()})
         if decoded.images is not None:  # the report's measure of Fig. 10b, on the scale of [-0.5, 0.5]
             cameras = zip(self.spec.image_keys, self.spec.channels, strict=True)
             metrics["pixel_error"] = th.stack([n * errors[key] for key, n in cameras]).sum() / len(decoded.images[0])
