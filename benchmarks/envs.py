@@ -187,8 +187,9 @@ def measure_clouds(repeats: int) -> list[tuple[str, float, float]]:
     import torch
 
     torch.set_num_threads(1)
-    from sb3_cpm.envs import clouds, make_maniskill_env
-    from sb3_cpm.envs import observations as obs_tools
+    from sb3_cpm.envs import make_maniskill_env
+    from sb3_cpm.envs.maniskill import clouds
+    from sb3_cpm.envs.maniskill import observations as obs_tools
 
     results = []
     for size in (32, 128):

@@ -232,7 +232,7 @@ def proposing(rounds: int) -> list[Result]:
     buffer = CPMBuffer(
         1000, GOAL_SPACE, ACTION_SPACE, device="cpu", filter_kwargs=dict(novelty_tolerance=1e5, relevance_tolerance=1e5)
     )
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     obs = {key: np.zeros((1, *box.shape), np.float32) for key, box in GOAL_SPACE.spaces.items()}  # type: ignore[misc]
     for step in range(200):
         buffer.add(obs, obs, np.zeros((1, 4)), np.ones(1), np.array([step == 199]), [{}])

@@ -44,7 +44,7 @@ import matplotlib.pyplot as plt
 
 if TYPE_CHECKING:
     from sb3_cpm.envs import ManiSkillEnv
-    from sb3_cpm.envs.scripted import PickCubeController
+    from sb3_cpm.envs.maniskill.scripted import PickCubeController
 
 CAMERAS = ("base_camera", "hand_camera")
 KEYS = (*CAMERAS, "state")
@@ -100,7 +100,7 @@ def record(env: "ManiSkillEnv", controller: "PickCubeController", seed: int, rng
 def record_all(n_training: int, n_held_out: int) -> list[Recorded]:
     """Episodes to learn from, then held-out ones."""
     from sb3_cpm.envs import make_maniskill_env
-    from sb3_cpm.envs.scripted import PickCubeController
+    from sb3_cpm.envs.maniskill.scripted import PickCubeController
 
     env = make_maniskill_env("PickCube-v1", n_points=0, goal_points=0, ignore_terminations=True)
     env.action_space.seed(0)

@@ -231,20 +231,21 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
 
 
 def _doctor() -> int:
-    from sb3_cpm.doctor import run_doctor
+    from sb3_cpm.machine.doctor import run_doctor
 
     return run_doctor()
 
 
 def _setup_rendering(private: bool, system: bool) -> int:
-    from sb3_cpm.envs.rendering import setup_rendering
+    from sb3_cpm.machine.rendering import setup_rendering
 
     return setup_rendering(private=private, system=system)
 
 
 def _assets(env_ids: list[str], download: bool) -> int:
     try:
-        from sb3_cpm.envs import assets, vulkan
+        from sb3_cpm.envs.maniskill import assets
+        from sb3_cpm.machine import vulkan
 
         vulkan.activate_private()  # libraries that SAPIEN and OpenCV need
         if download:

@@ -139,7 +139,7 @@ def argument_names(taker: Callable[..., Any]) -> set[str] | None:
 
 
 @contextlib.contextmanager
-def told_where(where: str) -> Iterator[None]:
+def error_prefix(where: str) -> Iterator[None]:
     """
     For constructors that do not know what their arguments were read from.
 

@@ -248,8 +248,7 @@ class ChallengerCallback(BaseCallback):
         self._env.moved = moved
         model.env = self._env
         self._learn_started = model.start_time
-        buffer.has_challenger = self._is_running
-        buffer.stopwatch = self.stopwatch
+        buffer.attach_challenger(self._is_running, self.stopwatch)
         if not buffer.challenge_ratio and (model.replay_buffer_kwargs or {}).get("challenge_ratio", 1):
             warnings.warn(
                 "The replay buffer has challenge_ratio=0, as one that Dreamer has filled: the player will be given no "
@@ -453,8 +452,7 @@ class ChallengerCallback(BaseCallback):
         self.model.env = without_exploration(self.model.env)
         buffer = self.model.replay_buffer  # type: ignore[attr-defined]
         if isinstance(buffer, CPMBuffer):
-            buffer.has_challenger = False
-            buffer.stopwatch = None
+            buffer.detach_challenger()
         if self._previous_sigint is not None:
             signal.signal(signal.SIGINT, self._previous_sigint)
             self._previous_sigint = None

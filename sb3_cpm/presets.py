@@ -8,8 +8,8 @@ world model: images only, and two heads, for images and reward. Both leave out t
 trains beside that for exploration (``train_task_behavior=True``), and by which C never acts. The number of ensemble heads is
 not in the report; 10 is ours. ``"default"`` measures novelty by an ensemble of embeddings of observations instead of latents,
 and is small enough for two CPU cores: an update takes about 0.03 CPU seconds for vectors and 0.06 for two 32x32 cameras.
-``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU add
-``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that differ from
+``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU
+add ``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that differ from
 ``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument. :class:`Preset`
 says what each of them means.
 """

@@ -17,7 +17,7 @@ import torch as th
 from gymnasium.utils import seeding
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_cpm.envs import vulkan
+from sb3_cpm.machine import vulkan
 
 th.set_num_threads(1)
 vulkan.activate_private()  # SAPIEN's and OpenCV's libraries, where there is a private installation: tests import them directly

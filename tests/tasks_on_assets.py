@@ -11,8 +11,9 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from sb3_cpm.envs import GoalView, ManiSkillEnv, assets, make_maniskill_env
-from sb3_cpm.envs.tasks import REPORT_TASKS, register_tasks
+from sb3_cpm.envs import GoalView, ManiSkillEnv, make_maniskill_env
+from sb3_cpm.envs.maniskill import assets
+from sb3_cpm.envs.maniskill.tasks import REPORT_TASKS, register_report_tasks
 
 CONTROLLERS = ("pd_ee_delta_pose", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 STEPS = {"TurnFaucet-v1": 200, "OpenCabinetDrawer-v1": 100, "OpenCabinetDoor-v1": 100}
@@ -20,7 +21,7 @@ FREE = ("PickCube-v1", "StackCube-v1", "LiftCube-v1")
 
 
 def make(env_id: str, **kwargs: Any) -> ManiSkillEnv:
-    register_tasks()
+    register_report_tasks()
     if any(asset.problems for asset in assets.assets_of(env_id)):
         pytest.skip(f"the objects of {env_id} are not here")
     return make_maniskill_env(env_id, **{"image_size": 16, "n_points": 32, **kwargs})

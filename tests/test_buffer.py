@@ -43,7 +43,8 @@ class Played:
     def __init__(self, n_envs=1, size=50, has_challenger=True, **kwargs):
         self.n_envs, self.size = n_envs, size
         self.buffer = CPMBuffer(size * n_envs, OBSERVATION_SPACE, ACTION_SPACE, n_envs=n_envs, device="cpu", **kwargs)
-        self.buffer.has_challenger = has_challenger
+        if has_challenger:
+            self.buffer.attach_challenger()
         self.episode, self.step = np.zeros(n_envs, int), np.zeros(n_envs, int)
         self.n_steps = 0
         self.complete = []  # (env, episode, number of the step it began with, length, terminated)
@@ -167,7 +168,7 @@ def test_against_a_list_of_episodes(n_envs, size, end_probability, mix, seed):
                 check_transitions(buffer._sample_own(0, 8, None), present)
             if rng.random() < 0.3:
                 buffer = played.buffer = pickle.loads(pickle.dumps(buffer))
-                buffer.has_challenger = True
+                buffer.attach_challenger()
 
 
 def test_samples_are_uniform_over_complete_episodes():
@@ -266,7 +267,7 @@ def test_a_challenge_ends_with_its_episode_and_the_oldest_makes_room():
 
 def test_executed_actions_are_stored():
     buffer = CPMBuffer(20, OBSERVATION_SPACE, ACTION_SPACE, n_envs=2, device="cpu")
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     obs = OBSERVATION_SPACE.sample()
     obs = {key: np.stack([value, value]) for key, value in obs.items()}
     asked = np.full((2, 2), 0.5, dtype=np.float32)
@@ -470,7 +471,7 @@ def test_what_is_in_the_buffer_can_be_looked_at():
 def test_degenerate_episodes_have_documented_outcomes(rewards, length):
     """One step, exactly the warm-up, one counted step; rewards all zero or negative; all scores equal."""
     buffer = CPMBuffer(50, OBSERVATION_SPACE, ACTION_SPACE, device="cpu")
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     obs = {"state": np.zeros((1, 3), np.float32), "camera": np.zeros((1, 2, 2, 3), np.uint8)}
     for step in range(length):
         buffer.add(obs, obs, np.zeros((1, 2)), np.array([rewards]), np.array([step == length - 1]), [{}])

@@ -75,7 +75,7 @@ class Machine(RuleBasedStateMachine):
             storage_dtypes={"state": "float16"} if compact else None,
             filter_kwargs=dict(novelty_tolerance=1e5, relevance_tolerance=1e5, highlight_tolerance=1e-5),
         )
-        self.buffer.has_challenger = True
+        self.buffer.attach_challenger()
         self.told = [Told(env, 0) for env in range(n_envs)]
         self.current = list(self.told)
         self.demonstrations = []
@@ -129,7 +129,7 @@ class Machine(RuleBasedStateMachine):
     @rule()
     def reset_from_outside(self):
         """The next observations don't continue the episodes: they end as truncations, with the next add()."""
-        self.buffer.has_challenger = True
+        self.buffer.attach_challenger()
         for episode in list(self.current):
             if episode.length:
                 self.end(episode, terminated=False)
@@ -186,7 +186,7 @@ class Machine(RuleBasedStateMachine):
                 self.buffer = CPMBuffer.load(path)
         else:
             self.buffer = pickle.loads(pickle.dumps(self.buffer))
-        self.buffer.has_challenger = True
+        self.buffer.attach_challenger()
 
     @precondition(lambda self: self.buffer.episodes_ended)
     @rule(seed=st.integers(0, 10**6), batch_size=st.integers(1, 20))

@@ -373,7 +373,7 @@ def test_vec_normalize_normalizes_all_shares():
     buffer = CPMBuffer(
         200, venv.observation_space, ACTIONS, venv, "cpu", n_envs=2, n_sampled_goal=3, challenge_ratio=0.5, mix="row"
     )
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     venv.reset()
     obs = venv.get_original_obs()
     for _ in range(90):  # 18 episodes: filters may refuse a few in a row

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_cpm.envs import clouds, observations
+from sb3_cpm.envs.maniskill import clouds, observations
 
 
 def picture(ids: list[list[int]], position: list[list[list[int]]], cam2world: np.ndarray) -> clouds.Picture:

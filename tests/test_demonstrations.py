@@ -106,7 +106,7 @@ def test_shares_that_exceed_one(mix):
 def test_rounded_shares_never_exceed_the_batch(challenges, demonstrations, batch_size):
     """Half a row more for each would be one too many."""
     buffer = make(mix="row", challenge_ratio=challenges, demonstration_ratio=demonstrations, warmup_steps=2)
-    buffer.has_challenger = True
+    buffer.attach_challenger()
     buffer.add_demonstrations([demonstration(1, 4)])
     play(buffer, 10)
     episode = buffer.episodes[0]
@@ -295,7 +295,7 @@ def test_files_that_cannot_be_read(broken, tmp_path):
 @pytest.mark.maniskill
 def test_states_are_recorded_without_a_renderer(tmp_path):
     environment = os.environ | dict.fromkeys(("VK_DRIVER_FILES", "VK_ICD_FILENAMES"), "/nonexistent.json")
-    command = [sys.executable, "-m", "sb3_cpm.envs.scripted", str(tmp_path), "--episodes", "1"]
+    command = [sys.executable, "-m", "sb3_cpm.envs.maniskill.scripted", str(tmp_path), "--episodes", "1"]
     child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert child.returncode == 0 and (tmp_path / "scripted.h5").exists(), child.stderr
 
@@ -305,7 +305,7 @@ def test_states_are_recorded_without_a_renderer(tmp_path):
 def test_scripted_pickcube_is_recorded_and_replayed(tmp_path):
     """Recorded in state mode, as ManiSkill's own demonstrations are; replayed with images and clouds."""
     from sb3_cpm.envs import make_maniskill_env
-    from sb3_cpm.envs.scripted import record
+    from sb3_cpm.envs.maniskill.scripted import record
 
     path = record(tmp_path, 3)
     with h5py.File(path) as file:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from sb3_cpm import doctor
-from sb3_cpm.envs import rendering
+from sb3_cpm.machine import doctor, rendering
+from sb3_cpm.machine.memory import memory_gib
 
 WORKS = rendering.Probe(rendering.Renderer("cpu", "llvmpipe", True), "Mesa 25.0.7", "", 1.0)
 
@@ -37,7 +37,7 @@ def test_no_vulkan_is_not_well(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 def test_each_lack_has_a_cure(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(rendering, "probe_renderer", lambda: WORKS._replace(renderer=None, problem="It died of SIGSEGV."))
-    monkeypatch.setattr(doctor, "_memory_gib", lambda: (0.5, 8.0))
+    monkeypatch.setattr(doctor, "memory_gib", lambda: (0.5, 8.0))
     monkeypatch.setattr(doctor, "PYTHONS", ((3, 7), (3, 8)))
     monkeypatch.setattr(doctor, "OPTIONAL", ("a-package-that-nobody-has",))
     monkeypatch.setattr(doctor, "DISK", 1e9)
@@ -75,8 +75,8 @@ def test_the_package_imports_without_maniskill() -> None:
     code = """
 import sys
 sys.modules["mani_skill"] = sys.modules["sapien"] = None  # as if not installed
-import sb3_cpm, sb3_cpm.envs, sb3_cpm.doctor
-from sb3_cpm.envs import rendering
+import sb3_cpm, sb3_cpm.envs, sb3_cpm.machine.doctor
+from sb3_cpm.machine import rendering
 import importlib.util
 found = importlib.util.find_spec
 importlib.util.find_spec = lambda name: None if name in ("mani_skill", "sapien") else found(name)
@@ -94,7 +94,7 @@ def test_a_broken_torch_is_a_finding(tmp_path: Path) -> None:
     """Even where ``import torch`` fails, doctor and help answer."""
     (tmp_path / "torch").mkdir()
     (tmp_path / "torch/__init__.py").write_text("raise OSError('libcudnn.so.9: cannot open shared object file')")
-    path = os.pathsep.join((str(tmp_path), str(Path(doctor.__file__).parents[1])))
+    path = os.pathsep.join((str(tmp_path), str(Path(doctor.__file__).parents[2])))
     run = partial(subprocess.run, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=600)
     child = run([sys.executable, "-m", "sb3_cpm", "doctor"])
     assert "FAIL  torch                 libcudnn.so.9" in child.stdout, child.stderr
@@ -103,12 +103,12 @@ def test_a_broken_torch_is_a_finding(tmp_path: Path) -> None:
 
 
 def test_a_container_limit_counts(tmp_path: Path) -> None:
-    free, total = doctor._memory_gib()
+    free, total = memory_gib()
     assert 0 < free <= total
     (tmp_path / "memory.max").write_text(f"{2**28}\n")
     (tmp_path / "memory.current").write_text(f"{2**27}\n")
-    assert doctor._memory_gib(tmp_path) == (0.125, 0.25)
+    assert memory_gib(tmp_path) == (0.125, 0.25)
     (tmp_path / "memory.stat").write_text(f"anon 0\ninactive_file {2**26}\n")  # cache, given back when it is needed
-    assert doctor._memory_gib(tmp_path) == (0.1875, 0.25)
+    assert memory_gib(tmp_path) == (0.1875, 0.25)
     (tmp_path / "memory.max").write_text("max\n")
-    assert doctor._memory_gib(tmp_path)[1] == total
+    assert memory_gib(tmp_path)[1] == total

@@ -16,7 +16,7 @@ import sb3_cpm.zoo  # noqa: F401  (registers CPM/...)
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.envs import make_maniskill_env
-from sb3_cpm.envs.goals import Goal, GoalVecEnv, GoalView
+from sb3_cpm.envs.maniskill.goals import Goal, GoalVecEnv, GoalView
 
 FAKE_GOAL = Goal("thing", "aim", 0.1, axes=2)
 

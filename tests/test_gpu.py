@@ -10,7 +10,7 @@ from challenger_helpers import BOTH, SMALL, VECTOR, box, random_batch, weights
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.type_aliases import SequenceBatch
-from sb3_cpm.uncertainty import Plan2Explore, Transitions
+from sb3_cpm.uncertainty import LatentDisagreement, Transitions
 from sb3_cpm.world_model.fast.cuda_graphs import Graphed, GraphPool
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -94,7 +94,7 @@ def test_cuda_graphs_for_batches_of_any_shape_with_missing_rows() -> None:
     assert len(challenger.learner.graphs.functions["world model"].recordings) == 2
 
 
-class Looks(Plan2Explore):
+class Looks(LatentDisagreement):
     """Looks at a number, which no CUDA graph can."""
 
     def novelty(self, transitions: Transitions) -> torch.Tensor:

@@ -15,9 +15,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetExtractor, PointNetPolicy
 from sb3_cpm import __main__ as cli
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.envs import DictObservation, rendering
+from sb3_cpm.envs import DictObservation
 from sb3_cpm.envs.suites import register_suite
 from sb3_cpm.extras import MissingExtra, check_installed, needed
+from sb3_cpm.machine import rendering
 from sb3_cpm.presets import make_preset
 from sb3_cpm.world_model.observations import ObservationSpec
 from sb3_cpm.zoo import __main__ as zoo_cli

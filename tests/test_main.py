@@ -101,8 +101,8 @@ def test_train_and_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_doctor_and_rendering_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_cpm.doctor.run_doctor", lambda: 3)
-    monkeypatch.setattr("sb3_cpm.envs.rendering.setup_rendering", lambda private, system: 4 + private + 2 * system)
+    monkeypatch.setattr("sb3_cpm.machine.doctor.run_doctor", lambda: 3)
+    monkeypatch.setattr("sb3_cpm.machine.rendering.setup_rendering", lambda private, system: 4 + private + 2 * system)
     assert cli.main(["doctor"]) == 3
     assert cli.main(["setup-rendering"]) == 4
     assert cli.main(["setup-rendering", "--private"]) == 5

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_cpm.callbacks import max_episode_steps
 from sb3_cpm.envs import ManiSkillEnv, make_maniskill_env
-from sb3_cpm.envs.observations import to_host
+from sb3_cpm.envs.maniskill.observations import to_host
 
 CAMERAS = ("base_camera", "hand_camera")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sb3_cpm.__main__ import main
-from sb3_cpm.envs import rendering, vulkan, vulkan_install
+from sb3_cpm.machine import rendering, vulkan, vulkan_install
 
 NOWHERE = {"VK_DRIVER_FILES": "/nonexistent.json", "VK_ICD_FILENAMES": "/nonexistent.json"}
 """A machine without Vulkan, as far as Vulkan's loader can tell."""
@@ -252,7 +252,7 @@ def test_a_private_driver_is_used(tmp_path: Path) -> None:
         (tmp_path / "vulkan/root").symlink_to(vulkan.private_folder() / "root")
     code = """
 import os
-from sb3_cpm.envs import rendering
+from sb3_cpm.machine import rendering
 renderer = rendering.ensure_renderer()
 assert renderer.software and os.environ["VK_DRIVER_FILES"] == os.environ["VK_ICD_FILENAMES"]
 print(os.environ["VK_DRIVER_FILES"])
@@ -266,7 +266,8 @@ print(os.environ["VK_DRIVER_FILES"])
 PICTURES = """
 import sys
 import numpy as np
-from sb3_cpm.envs import make_maniskill_env, rendering
+from sb3_cpm.envs import make_maniskill_env
+from sb3_cpm.machine import rendering
 if sys.argv[1] == "stock":
     rendering.use_fast_shaders = lambda: False
 env = make_maniskill_env("PickCube-v1", image_size=16, render_size=48, visuals="light")

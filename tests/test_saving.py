@@ -55,7 +55,7 @@ ACTIONS = spaces.Box(np.array([-1, -2], np.float32), np.array([1, 2], np.float32
 COMPACT = {"cloud": ["float16"] * 3 + [("uint8", -1.0, 1.0)] * 3, "state/%": ("uint16", -1.0, 2.0)}
 LENIENT = dict(novelty_tolerance=1e5, relevance_tolerance=1e5, highlight_tolerance=1e-5)
 #: Attributes that belong to where an object is used, not to what it holds.
-OF_PLACE = {"env", "stopwatch", "_has_challenger", "_allocate", "_remove", "_given"}
+OF_PLACE = {"env", "_stopwatch", "_challenger_is_running", "_allocate", "_remove", "_given"}
 
 
 def differences(one: Any, other: Any, name: str = "") -> Iterator[str]:
@@ -108,7 +108,7 @@ class Player:
         self.observation = observation(self.rng, n_envs)
 
     def play(self, buffer: CPMBuffer, steps: int, propose: bool = True) -> None:
-        buffer.has_challenger = True
+        buffer.attach_challenger()
         for _ in range(steps):
             following = observation(self.rng, self.n_envs)
             dones = self.rng.random(self.n_envs) < 0.1

@@ -17,7 +17,9 @@ import pytest
 import standin_assets
 
 from sb3_cpm.__main__ import main
-from sb3_cpm.envs import assets, make_maniskill_env, vulkan
+from sb3_cpm.envs import make_maniskill_env
+from sb3_cpm.envs.maniskill import assets
+from sb3_cpm.machine import vulkan
 
 pytestmark = pytest.mark.maniskill
 
@@ -280,7 +282,7 @@ STATES = """
 import hashlib
 import numpy as np
 from sb3_cpm.envs import make_maniskill_env
-from sb3_cpm.envs.tasks import REPORT_TASKS
+from sb3_cpm.envs.maniskill.tasks import REPORT_TASKS
 for env_id in REPORT_TASKS:
     try:
         env = make_maniskill_env(env_id, obs_mode="state")

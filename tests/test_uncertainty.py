@@ -1,4 +1,4 @@
-"""Plan2Explore: ensemble, exp metric and its dynamic scale (SPEC of the method, section 2)."""
+"""LatentDisagreement: ensemble, exp metric and its dynamic scale (SPEC of the method, section 2)."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.plan2explore import Ensemble, ExpScale, Plan2Explore
+from sb3_cpm.uncertainty.latent_disagreement import Ensemble, ExpScale, LatentDisagreement
 
 SIZES = LatentSizes(feat=6, action=2, stoch=2, deter=4, embed=5)
 
@@ -15,8 +15,8 @@ def transitions(n: int = 32) -> Transitions:
     return Transitions(torch.randn(n, 6), torch.rand(n, 2), torch.randn(n, 2), torch.randn(n, 4), torch.randn(n, 5))
 
 
-def make(**kwargs: object) -> Plan2Explore:
-    return Plan2Explore(SIZES, **{"heads": 4, "layers": 1, "units": 16, **kwargs})  # type: ignore[arg-type]
+def make(**kwargs: object) -> LatentDisagreement:
+    return LatentDisagreement(SIZES, **{"heads": 4, "layers": 1, "units": 16, **kwargs})  # type: ignore[arg-type]
 
 
 def test_the_ensemble_is_k_separate_networks() -> None:

@@ -23,10 +23,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecEnv, VecNormalize
 
-from sb3_cpm.envs import ManiSkillVecEnv, make_maniskill_env, make_maniskill_vec_env, simulation
-from sb3_cpm.envs.batch import ManiSkillBatch
-from sb3_cpm.envs.clouds import CloudSettings
-from sb3_cpm.envs.visuals import Visuals
+from sb3_cpm.envs import ManiSkillVecEnv, make_maniskill_env, make_maniskill_vec_env
+from sb3_cpm.envs.maniskill import simulation
+from sb3_cpm.envs.maniskill.batch import ManiSkillBatch
+from sb3_cpm.envs.maniskill.clouds import CloudSettings
+from sb3_cpm.envs.maniskill.visuals import Visuals
 from sb3_cpm.extractors import PointNetPolicy
 
 Tree = dict[str, np.ndarray]
@@ -36,7 +37,7 @@ Tree = dict[str, np.ndarray]
 def where(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the tensors of the stand-in for what they are, and for those of a GPU."""
     if request.param == "device":
-        monkeypatch.setattr("sb3_cpm.envs.observations._on_host", lambda leaf: False)
+        monkeypatch.setattr("sb3_cpm.envs.maniskill.observations._on_host", lambda leaf: False)
 
 
 def fake(num_envs: int = 3, limit: int = 6, n_points: int = 20, **kwargs: Any) -> ManiSkillVecEnv:
@@ -182,7 +183,7 @@ def test_seeds_rule_the_whole_run() -> None:
 
 
 def test_one_copy_to_the_host_per_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_cpm.envs.observations._on_host", lambda leaf: False)
+    monkeypatch.setattr("sb3_cpm.envs.maniskill.observations._on_host", lambda leaf: False)
     env = fake(limit=5)
     env.reset()
     transfers: list[int] = []

@@ -9,7 +9,8 @@ import pytest
 import standin_assets
 import trimesh
 
-from sb3_cpm.envs import meshes, rendering, visuals
+from sb3_cpm.envs.maniskill import meshes, visuals
+from sb3_cpm.machine import rendering
 
 pytestmark = pytest.mark.maniskill
 

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.plan2explore import TARGETS, Plan2Explore
+from sb3_cpm.uncertainty.latent_disagreement import TARGETS, LatentDisagreement
 from sb3_cpm.world_model.distributions import CategoricalLatent, GaussianLatent, TruncatedNormal
 from sb3_cpm.world_model.losses import balanced_kl, lambda_returns
 from sb3_cpm.world_model.optimizer import Optimizer
@@ -303,7 +303,7 @@ def test_15_no_transition_crosses_an_episode_boundary() -> None:
 
 def test_16_heads_reach_targets_far_from_zero() -> None:
     """16: heads with tanh at the end could not reach their targets."""
-    measure = Plan2Explore(LatentSizes(2, 1, 1, 1, 1), heads=3, layers=1, units=32, target="deter")
+    measure = LatentDisagreement(LatentSizes(2, 1, 1, 1, 1), heads=3, layers=1, units=32, target="deter")
     feat = torch.randn(64, 2)
     batch = Transitions(feat, torch.zeros(64, 1), feat[:, :1], 10.0 * feat[:, :1].clamp(-1.0, 1.0))
     adam = torch.optim.Adam(measure.parameters(), lr=1e-2)
@@ -334,7 +334,7 @@ def test_17_plan2explore_runs(target: str, preset: dict, metric: str) -> None:
 @pytest.mark.parametrize("metric", ["exp", "log"])
 def test_17_identical_heads_are_finite_and_minimal(metric: str) -> None:
     """17: the logarithm of a disagreement of zero, and the infinite slope of its root."""
-    measure = Plan2Explore(LatentSizes(3, 2, 1, 2, 1), heads=4, layers=1, units=8, metric=metric)
+    measure = LatentDisagreement(LatentSizes(3, 2, 1, 2, 1), heads=4, layers=1, units=8, metric=metric)
     batch = Transitions(torch.randn(9, 3, requires_grad=True), torch.rand(9, 2), torch.zeros(9, 1), torch.zeros(9, 2))
     different = measure.novelty(batch).detach()
     with torch.no_grad():
@@ -369,7 +369,7 @@ def test_18_learning_rates_arrive_and_all_heads_are_clipped() -> None:
     optimizers = small(preset={**SMALL, **rates}).optimizers
     found = {name: optimizer.adam.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
     assert found == {"world_model": 1e-3, "uncertainty": 2e-3, "exploration_actor": 3e-3, "exploration_critic": 4e-3}
-    measure = Plan2Explore(LatentSizes(3, 2, 1, 2, 1), heads=4, layers=1, units=8)
+    measure = LatentDisagreement(LatentSizes(3, 2, 1, 2, 1), heads=4, layers=1, units=8)
     optimizer = Optimizer("uncertainty", [measure], 1e-3, clip=1e-12, eps=1.0, weight_decay=0.0)
     before = [parameter.clone() for parameter in measure.parameters()]
     batch = Transitions(torch.randn(9, 3), torch.rand(9, 2), torch.randn(9, 1), torch.randn(9, 2))

@@ -28,10 +28,10 @@ from sb3_cpm.arguments import (
     check,
     check_arguments,
     check_names,
+    error_prefix,
     integer,
     nearest,
     number,
-    told_where,
 )
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
@@ -96,7 +96,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
     _check_numbers(hyperparameters, where)
     for key in ("callback", "env_wrapper", "vec_env_wrapper"):
-        with told_where(f"{where}, {key}"):
+        with error_prefix(f"{where}, {key}"):
             named = named_with_arguments(hyperparameters.get(key))
         for name, kwargs in named:
             _check_made_of(_imported(name, f"{where}, {key}"), kwargs, f"{where}, {key} {name}")
@@ -170,7 +170,7 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
 def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
     check_arguments(where, kwargs, taker)
     if taker is ChallengerCallback:
-        with told_where(where):
+        with error_prefix(where):
             ChallengerCallback(**kwargs)  # checks its arguments, and makes nothing before learn()
 
 
@@ -185,7 +185,7 @@ def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgori
         if issubclass(algorithm, OffPolicyAlgorithm) and (hyperparameters.get("n_steps") or 1) > 1:
             raise ValueError(f"{where}: {ONE_STEP}")
         arguments = {**_defaults(CPMBuffer), **kwargs}
-        with told_where(where):
+        with error_prefix(where):
             for part in (check_values, ChallengeCurator):
                 part(**{name: arguments[name] for name in inspect.signature(part).parameters})
 
@@ -235,7 +235,7 @@ def _defaults(taker: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _check_world_model(given: Mapping[str, Any], where: str) -> None:
-    with told_where(where):
+    with error_prefix(where):
         preset = make_preset(given.get("preset") or "default")
         # that of the one to start from is not known here
         kind = given.get("uncertainty_class") or (None if given.get("start_from") else "plan2explore")

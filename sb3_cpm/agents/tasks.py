@@ -11,6 +11,7 @@ import gymnasium as gym
 
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.arguments import nearest
+from sb3_cpm.envs.maniskill.tasks import knows_task
 from sb3_cpm.envs.suites import register_suite
 
 TASKS = (
@@ -67,17 +68,6 @@ def register_task(task: str, state: bool = False) -> None:
             disable_env_checker=True,
             order_enforce=False,
         )
-
-
-def knows_task(task: str) -> bool:
-    """:return: whether ManiSkill has a task of that name; it is imported for that"""
-    import mani_skill.envs  # noqa: F401  # registers them
-    from mani_skill.utils.registration import REGISTERED_ENVS
-
-    from sb3_cpm.envs import tasks
-
-    tasks.register_tasks()
-    return task in REGISTERED_ENVS
 
 
 def make_task(task: str, render_mode: str | None = None, **kwargs: Any) -> gym.Env:

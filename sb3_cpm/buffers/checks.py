@@ -122,7 +122,7 @@ def check_construction(buffer_size: int, n_envs: int, optimize_memory_usage: boo
         )
 
 
-def check_arguments(
+def check_buffer_arguments(
     observation_space: spaces.Space,
     action_space: spaces.Space,
     challenge_ratio: float,

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from sb3_cpm.arguments import names_checked
-from sb3_cpm.buffers.checks import check_arguments, check_shares, checked_infos
+from sb3_cpm.buffers.checks import check_buffer_arguments, check_shares, checked_infos
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import NOT_SAVED, EpisodeBuffer
@@ -123,7 +123,7 @@ class CPMBuffer(EpisodeBuffer):
         player_keys: Sequence[str] | None = None,
     ):
         given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
-        check_arguments(
+        check_buffer_arguments(
             observation_space, action_space, challenge_ratio, demonstration_ratio, mix, max_challenges, refresh_every
         )
         super().__init__(
@@ -154,18 +154,29 @@ class CPMBuffer(EpisodeBuffer):
         )
         #: Demonstrations, as a buffer of their own; None while there are none.
         self.demonstrations: EpisodeBuffer | None = None
-        self._has_challenger: Callable[[], bool] = bool  # False
-        self.stopwatch: Stopwatch | None = None
+        self.detach_challenger()
         self._forget_challenges()
+
+    # ------------------------------------------------------------------ who proposes challenges
+
+    def attach_challenger(self, is_running: Callable[[], bool] = lambda: True, stopwatch: Stopwatch | None = None) -> None:
+        """
+        Somebody calls :meth:`propose` from now on. Without, nothing would ever enter I, and :meth:`add` says so.
+
+        :param is_running: whether that is still so: a ``learn()`` may have ended in an exception
+        :param stopwatch: charged with "buffer"
+        """
+        self._challenger_is_running = is_running
+        self._stopwatch = Stopwatch() if stopwatch is None else stopwatch
+
+    def detach_challenger(self) -> None:
+        """Nobody does any more."""
+        self.attach_challenger(lambda: False)
 
     @property
     def has_challenger(self) -> bool:
-        """Whether the callback is there that feeds the curator; without it nothing would ever enter I."""
-        return self._has_challenger()
-
-    @has_challenger.setter
-    def has_challenger(self, there: bool | Callable[[], bool]) -> None:
-        self._has_challenger = there if callable(there) else lambda: there
+        """Whether somebody proposes challenges."""
+        return self._challenger_is_running()
 
     # ------------------------------------------------------------------ storage
 
@@ -215,11 +226,8 @@ class CPMBuffer(EpisodeBuffer):
             )
         infos = checked_infos(infos, self.n_envs)
         action = _executed(action, infos)
-        if self.stopwatch is None:
+        with self._stopwatch.section("buffer"):
             super().add(obs, next_obs, action, reward, done, infos)
-        else:
-            with self.stopwatch.section("buffer"):
-                super().add(obs, next_obs, action, reward, done, infos)
 
     def _remember(self, episode: Episode) -> None:
         if self.has_challenger:
@@ -247,9 +255,7 @@ class CPMBuffer(EpisodeBuffer):
         :raises RuntimeError: before the end of the first episode
         """
         self._check_can_sample()
-        if self.stopwatch is None:
-            return self._sample(batch_size, env)
-        with self.stopwatch.section("buffer"):
+        with self._stopwatch.section("buffer"):
             return self._sample(batch_size, env)
 
     def _sample(self, batch_size: int, env: VecNormalize | None) -> DictReplayBufferSamples:
@@ -462,12 +468,12 @@ class CPMBuffer(EpisodeBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        del state["stopwatch"], state["_has_challenger"]  # these belong to a running learn()
+        del state["_stopwatch"], state["_challenger_is_running"]  # these belong to a running learn()
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self.stopwatch, self.has_challenger = None, False
+        self.detach_challenger()
 
 
 def _executed(action: np.ndarray, infos: Sequence[dict[str, Any]]) -> np.ndarray:

@@ -20,7 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cpm.arguments import told_where
+from sb3_cpm.arguments import error_prefix
 
 logger = logging.getLogger(__name__)
 
@@ -232,7 +232,7 @@ def as_transitions(
     steps: list[tuple[Any, ...]] = []
     n_clipped = np.zeros(len(episodes), dtype=np.int64)
     for number, episode in enumerate(episodes):
-        with told_where(f"Demonstration {number} of {len(episodes)}"):
+        with error_prefix(f"Demonstration {number} of {len(episodes)}"):
             if not isinstance(episode, Demonstration):
                 raise ValueError(f"expected a sb3_cpm.buffers.Demonstration, got {type(episode).__name__}.")
             rewards = _rewards(episode)

@@ -47,7 +47,7 @@ from sb3_cpm.buffers.checks import (
 from sb3_cpm.buffers.compact import StorageSpec, make_codecs
 from sb3_cpm.buffers.saving import pack_space, unpack_space
 from sb3_cpm.buffers.sequences import draw_starts, read_sequences
-from sb3_cpm.buffers.storage import Episode, NextObservationView, ObservationRing, Transitions
+from sb3_cpm.buffers.storage import Episode, Locations, NextObservationView, ObservationRing
 from sb3_cpm.files import Archive, DamagedFileError, write_archive
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.type_aliases import SequenceBatch
@@ -84,9 +84,11 @@ class EpisodeBuffer(HerReplayBuffer):
         come from the environment's ``compute_reward``, see :class:`~sb3_cpm.buffers.CPMBuffer`
     :param goal_selection_strategy: one of 'episode', 'final', 'future'
     :param copy_info_dict: pass the infos to ``compute_reward()``
-    :param storage_dtypes: see :class:`~sb3_cpm.buffers.CPMBuffer`
-    :param memmap_dir: likewise
-    :param player_keys: likewise
+    :param storage_dtypes: compact storage of keys of floats, ``{"pointcloud": "float16"}``; ``("uint8", 0.0, 1.0)`` for
+        numbers between these bounds (without bounds: the space's), a list of such for one per feature of the last axis.
+        Batches hold the space's dtype as ever
+    :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
+    :param player_keys: observation keys that batches hold; None: all keys
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
@@ -410,7 +412,7 @@ class EpisodeBuffer(HerReplayBuffer):
         """As the parent's."""
         return self._hindsight_goals(self.ring.locate(batch_indices, env_indices), len(batch_indices))
 
-    def _hindsight_goals(self, at: Transitions, n: int) -> np.ndarray:
+    def _hindsight_goals(self, at: Locations, n: int) -> np.ndarray:
         """
         Goals for the first n transitions by ``goal_selection_strategy``. (NumPy's ``randint`` between arrays, which the parent
         uses, takes longer than all the rest of ``sample``.)

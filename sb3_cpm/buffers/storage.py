@@ -45,7 +45,7 @@ class Episode:
         return np.arange(self.start, self.start + self.length) % buffer_size
 
 
-class Transitions(NamedTuple):
+class Locations(NamedTuple):
     """
     Where ``n`` transitions are; made once and used for every key.
 
@@ -240,7 +240,7 @@ class ObservationRing:
 
     # ------------------------------------------------------------------ reading
 
-    def locate(self, rows: np.ndarray, envs: np.ndarray) -> Transitions:
+    def locate(self, rows: np.ndarray, envs: np.ndarray) -> Locations:
         """
         :param rows: slots of transitions, shape ``(n,)``
         :param envs: their environments, shape ``(n,)``
@@ -252,7 +252,7 @@ class ObservationRing:
         steps[steps < 0] += self.size
         return self._located(here, envs, starts, steps, lengths)
 
-    def locate_later(self, at: Transitions, steps: np.ndarray) -> Transitions:
+    def locate_later(self, at: Locations, steps: np.ndarray) -> Locations:
         """:return: other transitions of the same episodes, by their numbers"""
         rows = at.starts + steps
         rows[rows >= self.size] -= self.size
@@ -260,19 +260,19 @@ class ObservationRing:
 
     def _located(
         self, here: np.ndarray, envs: np.ndarray, starts: np.ndarray, steps: np.ndarray, lengths: np.ndarray
-    ) -> Transitions:
+    ) -> Locations:
         n_slots = self.size * self.n_envs
         following = here + self.n_envs
         following[following >= n_slots] -= n_slots
         ended = (steps == lengths - 1).nonzero()[0]
         final = self._flat_final_slot.take(here.take(ended))
-        return Transitions(here, envs, starts, steps, lengths, following, ended, final)
+        return Locations(here, envs, starts, steps, lengths, following, ended, final)
 
-    def read(self, key: str, at: Transitions) -> np.ndarray:
+    def read(self, key: str, at: Locations) -> np.ndarray:
         """:return: observations (a copy) in the space's dtype, shape ``(n, *observation_shape)``"""
         return self.codecs[key].decode(self._flat[key].take(at.here, axis=0))
 
-    def read_next(self, key: str, at: Transitions) -> np.ndarray:
+    def read_next(self, key: str, at: Locations) -> np.ndarray:
         """:return: next observations (a copy) in the space's dtype, shape ``(n, *observation_shape)``"""
         result = self._flat[key].take(at.following, axis=0)
         if len(at.ended):

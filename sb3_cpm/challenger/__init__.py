@@ -3,7 +3,7 @@ The challenger C: DreamerV2 world model, Plan2Explore ensemble, exploration acto
 
 ==============  ================================================================
 ``challenger``  :class:`Challenger`: its networks; it acts and judges
-``learning``    one update of all of them
+``learning``    one update of all of them; ``log_names``: what its numbers are called
 ``file``        what a saved one looks like, and what is checked before it is read
 ==============  ================================================================
 """

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import torch
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
@@ -40,7 +40,7 @@ from sb3_cpm.world_model.optimizer import Optimizer
 from sb3_cpm.world_model.rssm import LatentState
 from sb3_cpm.world_model.world_model import WorldModel
 
-Array = np.ndarray | torch.Tensor
+Array = np.ndarray | th.Tensor
 
 
 class Challenger:
@@ -65,7 +65,7 @@ class Challenger:
         self,
         observation_space: spaces.Dict,
         action_space: spaces.Box,
-        device: torch.device | str = "auto",
+        device: th.device | str = "auto",
         preset: PresetLike = "default",
         keys: Sequence[str] | None = None,
         uncertainty_class: str | type[Uncertainty] | None = None,
@@ -153,10 +153,10 @@ class Challenger:
 
         :param n: number of environments
         """
-        with torch.no_grad():
+        with th.no_grad():
             return self.world_model.rssm.initial_state(n)
 
-    @torch.no_grad()
+    @th.no_grad()
     def follow(
         self,
         state: LatentState,
@@ -177,26 +177,26 @@ class Challenger:
         :param deterministic: modes instead of samples, no random numbers
         :return: the state after the last row
         """
-        first = self._tensor(is_first, torch.bool)
+        first = self._tensor(is_first, th.bool)
         length, n = first.shape
         embed = self.world_model.encoder(self.spec.preprocess(observations, self.device)).unflatten(0, (length, n))
         rows = self.world_model.rssm.observe(
             embed,
             self._tensor(actions).view(length, n, self.action_dim),
             first,
-            None if mask is None else self._tensor(mask, torch.bool),
+            None if mask is None else self._tensor(mask, th.bool),
             state,
             deterministic,
         )
         return LatentState(*(part[-1] for part in rows))
 
-    @torch.no_grad()
+    @th.no_grad()
     def act(
         self,
         state: LatentState,
         deterministic: bool = False,
         behavior: str = "exploration",
-        noise: torch.Tensor | None = None,
+        noise: th.Tensor | None = None,
     ) -> np.ndarray:
         """
         Actions of one of its behaviours.
@@ -217,12 +217,12 @@ class Challenger:
         policy = self.behaviors[behavior].actor(state.feat)
         if deterministic:
             return policy.mode.cpu().numpy()
-        actions = policy.rsample() if noise is None else policy.at(torch.special.ndtr(noise))[0]
+        actions = policy.rsample() if noise is None else policy.at(th.special.ndtr(noise))[0]
         return actions.cpu().numpy()
 
     # ---- judging -----------------------------------------------------------------------------------------------------
 
-    @torch.no_grad()
+    @th.no_grad()
     def evaluate(self, observations: Mapping[str, Array], actions: Array) -> Evaluation:
         """
         Opinion of one complete episode of ``T`` transitions. It uses modes and no random numbers: the same episode gets the
@@ -237,8 +237,8 @@ class Challenger:
         taken = self._tensor(actions).view(-1, self.action_dim)
         length = len(taken) + 1
         # row t + 1 holds action t, the one that led to it
-        rows = torch.cat((torch.zeros_like(taken[:1]), taken)).unsqueeze(1)
-        first = torch.zeros(length, 1, dtype=torch.bool, device=self.device)
+        rows = th.cat((th.zeros_like(taken[:1]), taken)).unsqueeze(1)
+        first = th.zeros(length, 1, dtype=th.bool, device=self.device)
         first[0] = True
         embed = self.world_model.encoder(self.spec.preprocess(observations, self.device))
         if len(embed) != length:
@@ -247,7 +247,7 @@ class Challenger:
         kl = self.world_model.kl(posterior)[1:, 0]
         transitions = real_transitions(self.world_model, posterior, rows, embed.unsqueeze(1))
         novelty = checked_novelty(self.uncertainty, transitions)[:, 0]
-        if not (torch.isfinite(kl).all() and torch.isfinite(novelty).all()):
+        if not (th.isfinite(kl).all() and th.isfinite(novelty).all()):
             raise RuntimeError("KL or disagreement of an episode is not finite: are its observations and actions?")
         if self.uncertainty.nonnegative and bool((novelty < 0.0).any()):
             raise ValueError(
@@ -287,15 +287,15 @@ class Challenger:
         """
         return self.learner.train(batch)
 
-    def _tensor(self, array: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    def _tensor(self, array: Array, dtype: th.dtype = th.float32) -> th.Tensor:
         return to_tensor(array, self.device).to(dtype)
 
     # ---- saving ------------------------------------------------------------------------------------------------------
 
     @property
-    def networks(self) -> dict[str, torch.nn.Module]:
+    def networks(self) -> dict[str, th.nn.Module]:
         """Everything with weights, by name."""
-        parts: dict[str, torch.nn.Module] = {"world_model": self.world_model}
+        parts: dict[str, th.nn.Module] = {"world_model": self.world_model}
         if self._uncertainty is not None:
             parts["uncertainty"] = self._uncertainty
         return {**parts, **self.behaviors}
@@ -412,7 +412,7 @@ class Challenger:
     def load(
         cls,
         path: str | os.PathLike,
-        device: torch.device | str = "auto",
+        device: th.device | str = "auto",
         uncertainty_class: type[Uncertainty] | None = None,
         restore_rng: bool = False,
     ) -> "Challenger":
@@ -450,15 +450,15 @@ class Challenger:
 _NO_EXPLORATION = "This challenger has no {}: it was built with the preset entry 'train_exploration_behavior': False."
 
 
-def choose_device(device: torch.device | str) -> torch.device:
+def choose_device(device: th.device | str) -> th.device:
     """SB3's choice, but an explicit GPU that is not there is an error instead of a silent CPU."""
     try:
-        wanted = torch.device("cpu" if device == "auto" else device)
+        wanted = th.device("cpu" if device == "auto" else device)
     except RuntimeError as error:
         raise ValueError(f"Unknown device {str(device)!r}: use 'auto', 'cpu', 'cuda' or 'cuda:1'.") from error
     if wanted.type == "cuda":
-        if not torch.cuda.is_available():
+        if not th.cuda.is_available():
             raise ValueError(f"Device {str(device)!r} was asked for, but torch sees no GPU. Use device='auto' or 'cpu'.")
-        if (wanted.index or 0) >= torch.cuda.device_count():
-            raise ValueError(f"Device {str(device)!r} was asked for, but torch sees {torch.cuda.device_count()} GPU(s) only.")
+        if (wanted.index or 0) >= th.cuda.device_count():
+            raise ValueError(f"Device {str(device)!r} was asked for, but torch sees {th.cuda.device_count()} GPU(s) only.")
     return get_device(device)

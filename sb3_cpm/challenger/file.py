@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import torch as th
 from gymnasium import spaces
 
 from sb3_cpm.files import DamagedFileError, first_not_finite, verify, write_sealed
@@ -29,10 +29,10 @@ def write_file(path: str | os.PathLike, content: Mapping[str, Any]) -> None:
     :param content: tensors and plain data
     :raises NotWrittenError: if the disk does not take it; a file that is there already stays as it was
     """
-    write_sealed(path, partial(torch.save, {"format": FILE_FORMAT, "version": FILE_VERSION, **content}))
+    write_sealed(path, partial(th.save, {"format": FILE_FORMAT, "version": FILE_VERSION, **content}))
 
 
-def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
+def read_file(path: str | os.PathLike, device: th.device) -> dict[str, Any]:
     """
     Content of a saved challenger, checked.
 
@@ -47,7 +47,7 @@ def read_file(path: str | os.PathLike, device: torch.device) -> dict[str, Any]:
         )
     has_digest = verify(path, "challenger")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        content = th.load(path, map_location=device, weights_only=True)
     except Exception as error:  # an unpickler that reads something else fails in any way there is
         raise DamagedFileError(f"{path} is damaged or no saved challenger ({type(error).__name__}: {error}).") from error
     if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
@@ -90,9 +90,9 @@ def check_storable(name: str, values: Mapping[str, Any]) -> None:
     for key, value in values.items():
         file = io.BytesIO()
         try:
-            torch.save(value, file)
+            th.save(value, file)
             file.seek(0)
-            torch.load(file, weights_only=True)
+            th.load(file, weights_only=True)
         except Exception as error:  # picklers raise what they like
             raise ValueError(
                 f"{name}[{key!r}] is of {type(value)}, which cannot be read from a saved challenger. Give numbers, strings, "
@@ -161,12 +161,12 @@ def space_of(entry: Mapping[str, Any]) -> spaces.Box:
 
 def random_state() -> dict[str, Any]:
     """:return: state of torch's global random generators"""
-    cuda = [rng.cpu() for rng in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else []
-    return {"cpu": torch.get_rng_state(), "cuda": cuda}
+    cuda = [rng.cpu() for rng in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
+    return {"cpu": th.get_rng_state(), "cuda": cuda}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
     """:param state: of :func:`random_state`; that of GPUs counts where there are as many of them"""
-    torch.set_rng_state(state["cpu"].cpu())
-    if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda"]])
+    th.set_rng_state(state["cpu"].cpu())
+    if th.cuda.is_available() and len(state["cuda"]) == th.cuda.device_count():
+        th.cuda.set_rng_state_all([rng.cpu() for rng in state["cuda"]])

@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
-import torch
+import torch as th
 from torch import nn
 
+from sb3_cpm.challenger.log_names import short_names
 from sb3_cpm.presets import Preset
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty, checked_novelty
@@ -43,6 +44,7 @@ class Learner:
         self.world_model, self.uncertainty, self.behaviors = world_model, uncertainty, behaviors
         self.preset = preset
         self.updates = 0
+        self._log_names = {f"error_{key}": f"error_{name}" for key, name in short_names(world_model.spec.keys).items()}
         self.optimizers = self._make_optimizers()
         if preset.amp:
             check_mixed_precision(self.device)
@@ -56,7 +58,7 @@ class Learner:
             self.compiled = compile_modules(self._hot_modules(), self.device)
 
     @property
-    def device(self) -> torch.device:
+    def device(self) -> th.device:
         """Where all networks are."""
         return next(self.world_model.parameters()).device
 
@@ -95,30 +97,30 @@ class Learner:
             losses = self._run(f"{name} behaviour", partial(self.learn_behavior, name), *start, share)
             metrics.update(behavior.step(losses, self.optimizers))
         self.updates += 1
-        values = torch.stack([value.detach().to(torch.float32) for value in metrics.values()]).tolist()  # one transfer
-        return dict(zip(metrics, values, strict=True))
+        values = th.stack([value.detach().to(th.float32) for value in metrics.values()]).tolist()  # one transfer
+        return dict(zip((self._log_names.get(name, name) for name in metrics), values, strict=True))
 
-    def _run(self, name: str, function: Callable[..., Any], *inputs: torch.Tensor | None) -> Any:
+    def _run(self, name: str, function: Callable[..., Any], *inputs: th.Tensor | None) -> Any:
         return function(*inputs) if self.graphs is None else self.graphs.run(name, function, *inputs)
 
     def to_device(self, batch: SequenceBatch) -> Sequences:
         """:raises ValueError: if the batch has no valid row"""
-        mask = to_tensor(batch.mask, self.device).to(torch.bool)
+        mask = to_tensor(batch.mask, self.device).to(th.bool)
         if not bool(mask.any()):
             raise ValueError("The batch has no valid row: its mask is False everywhere.")
         return Sequences(
             self.world_model.spec.preprocess(batch.observations, self.device),
-            to_tensor(batch.actions, self.device).to(torch.float32).view(*mask.shape, self.world_model.action_dim),
-            to_tensor(batch.rewards, self.device).to(torch.float32),
-            to_tensor(batch.is_first, self.device).to(torch.bool),
-            to_tensor(batch.is_terminal, self.device).to(torch.bool),
+            to_tensor(batch.actions, self.device).to(th.float32).view(*mask.shape, self.world_model.action_dim),
+            to_tensor(batch.rewards, self.device).to(th.float32),
+            to_tensor(batch.is_first, self.device).to(th.bool),
+            to_tensor(batch.is_terminal, self.device).to(th.bool),
             mask,
         )
 
     # ---- world model -------------------------------------------------------------------------------------------------
 
     def learn_model(
-        self, images: torch.Tensor | None, vectors: torch.Tensor | None, *rest: torch.Tensor
+        self, images: th.Tensor | None, vectors: th.Tensor | None, *rest: th.Tensor
     ) -> tuple[WorldModelOutput, Gradients]:
         """The world model's losses for the parts of :class:`Sequences`, and their sum's gradients."""
         with mixed_precision(self.device, self.preset.amp):
@@ -126,9 +128,9 @@ class Learner:
         losses = {name: value.detach() for name, value in output.losses.items()}
         return output._replace(losses=losses), self.optimizers["world_model"].gradients(output.total)
 
-    def _step_world_model(self, output: WorldModelOutput, gradients: Gradients) -> dict[str, torch.Tensor]:
+    def _step_world_model(self, output: WorldModelOutput, gradients: Gradients) -> dict[str, th.Tensor]:
         total = output.total
-        if not torch.isfinite(total):
+        if not th.isfinite(total):
             broken = {name: value.item() for name, value in output.losses.items() if not math.isfinite(value.item())}
             raise RuntimeError(
                 f"The world model's loss became non-finite in the terms {broken or 'that are summed'}. {ADVICE}"
@@ -139,7 +141,7 @@ class Learner:
 
     # ---- uncertainty -------------------------------------------------------------------------------------------------
 
-    def train_uncertainty(self, batch: Sequences, output: WorldModelOutput) -> dict[str, torch.Tensor]:
+    def train_uncertainty(self, batch: Sequences, output: WorldModelOutput) -> dict[str, th.Tensor]:
         """
         :param batch: sequences
         :param output: what the world model made of them
@@ -165,10 +167,10 @@ class Learner:
         index = (valid if bool(valid.any()) else batch.mask).flatten().nonzero().squeeze(1)
         limit = self.preset.imagination_starts
         if limit is not None and len(index) > limit:
-            index = index[torch.randperm(len(index), device=self.device)[:limit]]
+            index = index[th.randperm(len(index), device=self.device)[:limit]]
         return output.posterior.flatten().select(index)
 
-    def _fill_up(self, start: LatentState, rows: int) -> tuple[LatentState, torch.Tensor | None]:
+    def _fill_up(self, start: LatentState, rows: int) -> tuple[LatentState, th.Tensor | None]:
         """
         CUDA graphs need the same number of states every time.
 
@@ -179,11 +181,11 @@ class Learner:
         if self.graphs is None:
             return start, None
         limit = self.preset.imagination_starts
-        n, place = len(start.deter), torch.arange(rows if limit is None else min(limit, rows), device=self.device)
+        n, place = len(start.deter), th.arange(rows if limit is None else min(limit, rows), device=self.device)
         return start.select(place % n), (place < n) * (len(place) / n)
 
     def learn_behavior(
-        self, name: str, deter: torch.Tensor, stoch: torch.Tensor, stats: torch.Tensor, share: torch.Tensor | None
+        self, name: str, deter: th.Tensor, stoch: th.Tensor, stats: th.Tensor, share: th.Tensor | None
     ) -> BehaviorLosses:
         """
         :param name: of the behaviour
@@ -194,22 +196,20 @@ class Learner:
         start = LatentState(deter, stoch, stats)
         return self.behaviors[name].losses(self.world_model, start, reward, self.optimizers, share)
 
-    def imagined_novelty(self, imagined: Imagination) -> torch.Tensor:
+    def imagined_novelty(self, imagined: Imagination) -> th.Tensor:
         """The exploration actor's reward, shape ``(H, n)``."""
         assert self.uncertainty is not None, "who explores has a measure of novelty"
         stoch = self.world_model.latent.size
         next_stoch, next_deter = imagined.next_feats[..., :stoch], imagined.next_feats[..., stoch:]
         return checked_novelty(self.uncertainty, Transitions(imagined.feats, imagined.actions, next_stoch, next_deter))
 
-    def imagined_reward(self, imagined: Imagination) -> torch.Tensor:
+    def imagined_reward(self, imagined: Imagination) -> th.Tensor:
         """The task actor's reward, shape ``(H, n)``."""
         with frozen(self.world_model.reward_head):
             return self.world_model.reward(imagined.next_feats)
 
 
-def real_transitions(
-    world_model: WorldModel, posterior: LatentState, actions: torch.Tensor, embed: torch.Tensor
-) -> Transitions:
+def real_transitions(world_model: WorldModel, posterior: LatentState, actions: th.Tensor, embed: th.Tensor) -> Transitions:
     """
     Transitions between consecutive rows. State t is paired with the action in row t + 1, which was taken in it.
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_cpm.arguments import ABOVE_0, check, check_arguments, check_each, integer, told_where
+from sb3_cpm.arguments import ABOVE_0, check, check_arguments, check_each, error_prefix, integer
 from sb3_cpm.challenges.filters import CandidateStatistics, ChallengeFilter
 from sb3_cpm.challenges.origin import OriginKind, RewardOrigin, measured
 from sb3_cpm.challenges.quality import ChallengeQuality, best_goal
@@ -58,8 +58,8 @@ class ChallengeCurator:
 
     :param warmup_steps: the first transitions of every trajectory that never count, because the latent state starts at
         zero and its surprise is meaningless [B.5.2]
-    :param kl_ratio: see :class:`~sb3_cpm.challenges.quality.ChallengeQuality`
-    :param reward_ratio: likewise; F1 uses it too
+    :param kl_ratio: target of mean(c1 * KL) over mean(DISAG), report: 0.1
+    :param reward_ratio: c*, target of mean(c * r) over mean(u), report: 0.75; F1 uses it too
     :param filter_kwargs: passed to :class:`~sb3_cpm.challenges.filters.ChallengeFilter`
     :param reward_kwargs: passed to :class:`~sb3_cpm.challenges.rewards.ArtificialReward`
     :param coefficient_kwargs: passed to every :class:`~sb3_cpm.challenges.targeting.DynamicCoefficient`
@@ -84,11 +84,11 @@ class ChallengeCurator:
         check_arguments("coefficient_kwargs", coefficient_kwargs, DynamicCoefficient, excluded=("target_ratio",))
         self.warmup_steps = warmup_steps
         self.origin = RewardOrigin(reward_origin)
-        with told_where("coefficient_kwargs"):
+        with error_prefix("coefficient_kwargs"):
             self.quality = ChallengeQuality(kl_ratio, reward_ratio, coefficient_kwargs)
-        with told_where("filter_kwargs"):
+        with error_prefix("filter_kwargs"):
             self.filter = ChallengeFilter(reward_ratio, **(filter_kwargs or {}))
-        with told_where("reward_kwargs"):
+        with error_prefix("reward_kwargs"):
             self.reward = ArtificialReward(coefficient_kwargs=coefficient_kwargs, **(reward_kwargs or {}))
 
     def propose(self, rewards: np.ndarray, evaluation: Evaluation) -> Proposal | None:

@@ -31,31 +31,37 @@ class Plan2Explore(DreamerAlgorithm):
 
     Predicting rewards shapes the latents, and by that a little of what is new; ``preset={"reward_gradient": False}`` ends it.
 
-    :param policy: as for Dreamer
-    :param env: as for Dreamer
-    :param learning_rate: as for Dreamer
-    :param buffer_size: as for Dreamer
-    :param learning_starts: as for Dreamer
-    :param train_freq: as for Dreamer
-    :param gradient_steps: as for Dreamer
-    :param pretrain_steps: as for Dreamer
-    :param action_noise: as for Dreamer
-    :param replay_buffer_class: as for Dreamer
-    :param replay_buffer_kwargs: as for Dreamer
+    :param policy: "MlpPolicy", "CnnPolicy" or "MultiInputPolicy", as SB3 users expect; the observation space alone decides
+        what is built, and a Dict may mix images and vectors
+    :param env: environment, or a name registered in gymnasium
+    :param learning_rate: of the world model, a number or a function of the remaining progress; the preset's by default. The
+        other learning rates keep the preset's ratios to it
+    :param buffer_size: number of transitions to keep
+    :param learning_starts: random steps at the beginning, over all environments. Learning also waits for the first
+        episode to end
+    :param train_freq: steps (of each environment) between two rounds of updates, or ``(n, "episode")``
+    :param gradient_steps: updates per round; -1: as many as transitions were collected
+    :param pretrain_steps: further updates at the very first round, before the behaviour acts for the first time: a behaviour
+        that has learnt from a model that knew nothing yet may collect data that teach it nothing else (DreamerV2 has 100)
+    :param action_noise: added to the actions of ``learn()`` within [-1, 1]; the policy is stochastic without it
+    :param replay_buffer_class: a :class:`~sb3_cpm.buffers.CPMBuffer`
+    :param replay_buffer_kwargs: its arguments, for example ``storage_dtypes`` or ``memmap_dir``
     :param uncertainty_class: what is new: "plan2explore", "rnd", "prediction_error", "observation_ensemble" or a subclass of
         :class:`~sb3_cpm.uncertainty.base.Uncertainty`. By default that of ``start_from``, "plan2explore" where there is none
     :param uncertainty_kwargs: its arguments, on top of the preset's and of those of ``start_from``
     :param train_task_behavior: also learn a behaviour for the task
-    :param preset: as for Dreamer
-    :param keys: as for Dreamer
-    :param start_from: as for Dreamer; exploration behaviour and uncertainty are taken over too, where there are such
-    :param policy_kwargs: as for Dreamer
-    :param stats_window_size: as for Dreamer
-    :param tensorboard_log: as for Dreamer
-    :param verbose: as for Dreamer
-    :param seed: as for Dreamer
-    :param device: as for Dreamer
-    :param _init_setup_model: as for Dreamer
+    :param preset: sizes and constants, a name or a dict of entries that differ, see :mod:`sb3_cpm.presets`
+    :param keys: keys of a Dict observation to read; all images and vectors by default
+    :param start_from: a saved model of this class or of :class:`~sb3_cpm.dreamer.Dreamer`, a challenger saved by
+        ``ChallengerCallback.save``, or one of these objects: its sizes, keys, world model and, where it has them, behaviours
+        and uncertainty are taken over, with their optimizers. ``preset`` may then change single entries
+    :param policy_kwargs: further arguments for the policy
+    :param stats_window_size: number of episodes that rollout statistics average over
+    :param tensorboard_log: folder for TensorBoard
+    :param verbose: 0 none, 1 messages, 2 debug messages
+    :param seed: for all random numbers
+    :param device: PyTorch device; a GPU that is not there is an error unless "auto"
+    :param _init_setup_model: build the networks now
     :raises ValueError: for spaces and arguments that cannot work
     """
 

@@ -34,10 +34,10 @@ class DreamerPolicy(BasePolicy):
     :param observation_space: a Dict, or a Box that is an image or a vector
     :param action_space: bounded Box
     :param lr_schedule: not needed here, SB3 passes it to every policy
-    :param preset: see :class:`~sb3_cpm.challenger.Challenger`
-    :param keys: likewise
-    :param uncertainty_class: likewise
-    :param uncertainty_kwargs: likewise
+    :param preset: sizes and constants, a name or a dict of entries that differ, see :mod:`sb3_cpm.presets`
+    :param keys: keys of a Dict observation to read; all images and vectors by default
+    :param uncertainty_class: who says what is new, a name or a class, see :class:`~sb3_cpm.challenger.Challenger`
+    :param uncertainty_kwargs: arguments for it, on top of the preset's
     :param behavior: which of its behaviours acts, "task" or "exploration"
     :param device: PyTorch device
     :raises ValueError: for spaces that it cannot work with, unknown preset entries, a behaviour that the preset leaves out

@@ -12,7 +12,7 @@ import contextlib
 import multiprocessing as mp
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -55,7 +55,7 @@ class RobustSubprocVecEnv(SubprocVecEnv):
 
     def __init__(
         self,
-        env_fns: list[Callable[[], gym.Env]],
+        env_fns: Sequence[Callable[[], gym.Env]],
         start_method: str | None = None,
         episodes_per_worker: int | None = None,
         timeout: float | None = None,
@@ -65,7 +65,7 @@ class RobustSubprocVecEnv(SubprocVecEnv):
         if timeout is not None and not timeout > 0:
             raise ValueError(f"timeout must be a positive number of seconds or None, got {timeout!r}.")
         try:
-            super().__init__(env_fns, start_method)
+            super().__init__(list(env_fns), start_method)
         except (EOFError, ConnectionError) as error:
             raise RuntimeError("A worker process died while it made its environment; its own message is above.") from error
         context = mp.get_context(start_method or ("forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"))

@@ -13,15 +13,15 @@ prediction_error      what was predicted badly                      high for eve
 
 from sb3_cpm.uncertainty.base import Transitions, Uncertainty
 from sb3_cpm.uncertainty.choice import UNCERTAINTY_CLASSES, check_uncertainties, choose_uncertainty
+from sb3_cpm.uncertainty.latent_disagreement import LatentDisagreement
 from sb3_cpm.uncertainty.observation_ensemble import ObservationEnsemble
-from sb3_cpm.uncertainty.plan2explore import Plan2Explore
 from sb3_cpm.uncertainty.prediction_error import PredictionError
 from sb3_cpm.uncertainty.rnd import RandomNetworkDistillation
 
 __all__ = [
     "UNCERTAINTY_CLASSES",
+    "LatentDisagreement",
     "ObservationEnsemble",
-    "Plan2Explore",
     "PredictionError",
     "RandomNetworkDistillation",
     "Transitions",

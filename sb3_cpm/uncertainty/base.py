@@ -9,7 +9,7 @@ imagination nothing was observed, so there are no embeddings; every measure says
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-import torch
+import torch as th
 from torch import nn
 
 from sb3_cpm.world_model.fast.one_hot import OneHot
@@ -29,23 +29,23 @@ class Transitions(NamedTuple):
     :param embed: encoder output of state t, shape ``(*batch, embed_dim)``; None in imagination
     """
 
-    feat: torch.Tensor
-    action: torch.Tensor
-    next_stoch: torch.Tensor
-    next_deter: torch.Tensor
-    next_embed: torch.Tensor | None = None
-    embed: torch.Tensor | None = None
+    feat: th.Tensor
+    action: th.Tensor
+    next_stoch: th.Tensor
+    next_deter: th.Tensor
+    next_embed: th.Tensor | None = None
+    embed: th.Tensor | None = None
 
     @property
-    def next_feat(self) -> torch.Tensor:
+    def next_feat(self) -> th.Tensor:
         """Whole latent of state t+1, shape ``(*batch, feat_dim)``."""
-        return torch.cat((self.next_stoch, self.next_deter), dim=-1)
+        return th.cat((self.next_stoch, self.next_deter), dim=-1)
 
     def flatten(self) -> "Transitions":
         """All batch dimensions in one."""
         return Transitions(*(None if part is None else part.flatten(0, -2) for part in self))  # type: ignore[arg-type]
 
-    def select(self, index: torch.Tensor | slice) -> "Transitions":
+    def select(self, index: th.Tensor | slice) -> "Transitions":
         """Those that an index, a mask or a slice picks."""
         return Transitions(*(None if part is None else part[index] for part in self))  # type: ignore[arg-type]
 
@@ -75,7 +75,7 @@ class Uncertainty(nn.Module, ABC):
         self.sizes = sizes
 
     @abstractmethod
-    def novelty(self, transitions: Transitions) -> torch.Tensor:
+    def novelty(self, transitions: Transitions) -> th.Tensor:
         """
         How new each transition is, differentiable with respect to all that it reads of a transition: the exploration actor
         climbs along this gradient, through the action and through the imagined states.
@@ -85,14 +85,14 @@ class Uncertainty(nn.Module, ABC):
         """
 
     @abstractmethod
-    def loss(self, transitions: Transitions) -> torch.Tensor:
+    def loss(self, transitions: Transitions) -> th.Tensor:
         """
         What one update minimises, a scalar. Transitions across episode boundaries and into padding are already left out.
 
         :param transitions: real ones without gradients, batch dimension ``(n,)``
         """
 
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         """
         Adjust whatever is adjusted by rule instead of by gradient; called once after each update.
 
@@ -102,7 +102,7 @@ class Uncertainty(nn.Module, ABC):
         return {"disagreement": self.novelty(transitions).mean().detach()}
 
 
-def checked_novelty(uncertainty: Uncertainty, transitions: Transitions) -> torch.Tensor:
+def checked_novelty(uncertainty: Uncertainty, transitions: Transitions) -> th.Tensor:
     """
     :param uncertainty: who says what is new, perhaps a class of the user's own
     :param transitions: real or imagined

@@ -6,13 +6,13 @@ from typing import Any
 from sb3_cpm.arguments import check_arguments, check_names, nearest
 from sb3_cpm.presets import Preset, plain
 from sb3_cpm.uncertainty.base import Uncertainty
+from sb3_cpm.uncertainty.latent_disagreement import LatentDisagreement
 from sb3_cpm.uncertainty.observation_ensemble import ObservationEnsemble
-from sb3_cpm.uncertainty.plan2explore import Plan2Explore
 from sb3_cpm.uncertainty.prediction_error import PredictionError
 from sb3_cpm.uncertainty.rnd import RandomNetworkDistillation
 
 UNCERTAINTY_CLASSES: dict[str, type[Uncertainty]] = {
-    "plan2explore": Plan2Explore,
+    "plan2explore": LatentDisagreement,
     "rnd": RandomNetworkDistillation,
     "prediction_error": PredictionError,
     "observation_ensemble": ObservationEnsemble,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch import nn
 
@@ -39,11 +39,11 @@ class Ensemble(nn.Module):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for size_in, size_out in pairwise(sizes):
             bound = math.sqrt(6.0 / (size_in + size_out))  # Glorot, for each head on its own
-            self.weights.append(nn.Parameter(torch.empty(heads, size_in, size_out).uniform_(-bound, bound)))
-            self.biases.append(nn.Parameter(torch.zeros(heads, 1, size_out)))
+            self.weights.append(nn.Parameter(th.empty(heads, size_in, size_out).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(th.zeros(heads, 1, size_out)))
         self.heads, self.one_hot = heads, one_hot
 
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
         :param inputs: shape ``(n, input_dim)``
         :return: shape ``(heads, n, output_dim)``
@@ -51,12 +51,12 @@ class Ensemble(nn.Module):
         hidden = inputs.expand(self.heads, *inputs.shape)
         last = len(self.weights) - 1
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            hidden = torch.baddbmm(bias, hidden, weight)
+            hidden = th.baddbmm(bias, hidden, weight)
             if layer < last:
                 hidden = elu_(hidden)
         return hidden
 
-    def predictions(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+    def predictions(self, inputs: th.Tensor) -> list[th.Tensor]:
         """
         The outputs of the heads, one by one, without copying them together.
 
@@ -65,7 +65,7 @@ class Ensemble(nn.Module):
         """
         return [one.unflatten(0, inputs.shape[:-1]) for one in self._predictions(inputs.flatten(0, -2))]
 
-    def disagreement(self, inputs: torch.Tensor) -> torch.Tensor:
+    def disagreement(self, inputs: th.Tensor) -> th.Tensor:
         """
         What :func:`disagreement` says of the :meth:`predictions`.
 
@@ -74,27 +74,27 @@ class Ensemble(nn.Module):
         """
         return self._disagreement(inputs.flatten(0, -2)).unflatten(0, inputs.shape[:-1])
 
-    def _predictions(self, inputs: torch.Tensor) -> Sequence[torch.Tensor]:
+    def _predictions(self, inputs: th.Tensor) -> Sequence[th.Tensor]:
         if not self._keeps_a_cpu_busy(inputs):
             return self(inputs).unbind(0)
         return Predictions.apply(inputs, self._choice(inputs), *self.weights, *self.biases)
 
-    def _disagreement(self, inputs: torch.Tensor) -> torch.Tensor:
-        weights_learn = torch.is_grad_enabled() and self.weights[0].requires_grad
+    def _disagreement(self, inputs: th.Tensor) -> th.Tensor:
+        weights_learn = th.is_grad_enabled() and self.weights[0].requires_grad
         if weights_learn or not self._keeps_a_cpu_busy(inputs):
             return disagreement(self._predictions(inputs))
         return Rating.apply(inputs, self._choice(inputs), *self.weights, *self.biases)
 
-    def _keeps_a_cpu_busy(self, inputs: torch.Tensor) -> bool:
+    def _keeps_a_cpu_busy(self, inputs: th.Tensor) -> bool:
         """Then the heads are computed one by one: a head's layers fit into the cache."""
         return is_large(inputs, self.biases[0].shape[-1])
 
-    def _choice(self, inputs: torch.Tensor) -> Choice | None:
+    def _choice(self, inputs: th.Tensor) -> Choice | None:
         """One for all heads."""
         return find_choice(inputs, self.one_hot, self.biases[0].shape[-1])
 
 
-def disagreement(predictions: Sequence[torch.Tensor] | torch.Tensor) -> torch.Tensor:
+def disagreement(predictions: Sequence[th.Tensor] | th.Tensor) -> th.Tensor:
     """
     Standard deviation over the heads, averaged over the dimensions.
 
@@ -104,7 +104,7 @@ def disagreement(predictions: Sequence[torch.Tensor] | torch.Tensor) -> torch.Te
     return Disagreement.apply(*predictions)
 
 
-def ensemble_loss(predictions: Sequence[torch.Tensor] | torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+def ensemble_loss(predictions: Sequence[th.Tensor] | th.Tensor, targets: th.Tensor) -> th.Tensor:
     """
     Squared error summed over heads and dimensions: a head learns the same whatever the number of the others.
 
@@ -115,4 +115,4 @@ def ensemble_loss(predictions: Sequence[torch.Tensor] | torch.Tensor, targets: t
         errors = [squared_error(one, targets).sum() for one in predictions]
     else:  # on a GPU launching operations is what takes time
         errors = [0.5 * F.mse_loss(one, targets, reduction="sum") for one in predictions]
-    return torch.stack(errors).sum() / len(targets)
+    return th.stack(errors).sum() / len(targets)

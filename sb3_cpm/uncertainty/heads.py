@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any
 
-import torch
+import torch as th
 from torch.autograd.function import once_differentiable
 
 from sb3_cpm.uncertainty.scale import EPSILON, root
@@ -20,17 +20,17 @@ from sb3_cpm.world_model.fast.one_hot import Choice
 
 RATED_ROWS = 1024  # states that go through all heads before the next ones
 
-Tensors = Sequence[torch.Tensor]
+Tensors = Sequence[th.Tensor]
 
 
-class Predictions(torch.autograd.Function):
+class Predictions(th.autograd.Function):
     """
     Inputs and, as :func:`_forward` has them, choice, weights and biases to each head's output. All heads' weights are one
     parameter, whose gradient is written head by head.
     """
 
     @staticmethod
-    def forward(ctx: Any, inputs: torch.Tensor, choice: Choice | None, *parameters: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Any, inputs: th.Tensor, choice: Choice | None, *parameters: th.Tensor) -> tuple[th.Tensor, ...]:
         layers = len(parameters) // 2
         outputs, hidden = _forward(inputs, choice, parameters[:layers], parameters[layers:])
         ctx.choice = choice
@@ -39,20 +39,20 @@ class Predictions(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
         inputs_learn, _, weights_learn, *others = ctx.needs_input_grad
         layers = (1 + len(others)) // 2
         inputs, *saved = ctx.saved_tensors
         weights, hidden = saved[:layers], saved[layers:]
-        to_inputs = torch.zeros_like(inputs) if inputs_learn else None
-        to_weights = [torch.empty_like(weight) for weight in weights] if weights_learn else []
+        to_inputs = th.zeros_like(inputs) if inputs_learn else None
+        to_weights = [th.empty_like(weight) for weight in weights] if weights_learn else []
         to_biases = [weight.new_empty(len(weight), 1, weight.shape[-1]) for weight in weights] if weights_learn else []
         for head, to_output in enumerate(gradients):
             values = [inputs, *hidden[head * (layers - 1) : (head + 1) * (layers - 1)]]
             matrices = [weight[head] for weight in weights]
             for layer, gradient in _backward(to_output.contiguous(), values, matrices):  # of a sum it has no strides
                 if weights_learn:
-                    torch.sum(gradient, 0, out=to_biases[layer][head, 0])
+                    th.sum(gradient, 0, out=to_biases[layer][head, 0])
                     if layer == 0 and ctx.choice is not None:
                         ctx.choice.write_gradient(inputs, gradient, to_weights[layer][head])
                     else:
@@ -62,7 +62,7 @@ class Predictions(torch.autograd.Function):
         return to_inputs, None, *(to_weights + to_biases if weights_learn else [None] * 2 * layers)
 
 
-class Disagreement(torch.autograd.Function):
+class Disagreement(th.autograd.Function):
     """
     Predictions of each head to their disagreement. Its gradient: d/dp_k of the standard deviation s is (p_k - mean) / (K * s).
 
@@ -71,26 +71,26 @@ class Disagreement(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, *predictions: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, *predictions: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(*predictions)
         dim = predictions[0].shape[-1]
         slices = cache_slices(*(one.view(-1, dim) for one in predictions))
-        result = torch.cat([root(_spread(parts)[1]).mean(-1) for parts in slices])
+        result = th.cat([root(_spread(parts)[1]).mean(-1) for parts in slices])
         return result.view(predictions[0].shape[:-1])
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, ...]:
         predictions = ctx.saved_tensors
         dim = predictions[0].shape[-1]
-        results = [torch.empty_like(one) for one in predictions]
+        results = [th.empty_like(one) for one in predictions]
         scale = gradient.reshape(-1, 1)
         for weight, *parts in cache_slices(scale, *(one.view(-1, dim) for one in (*predictions, *results))):
             _write_slopes(*_spread(parts[: len(predictions)]), weight, parts[len(predictions) :])
         return tuple(results)
 
 
-class Rating(torch.autograd.Function):
+class Rating(th.autograd.Function):
     """
     :class:`Disagreement` of :class:`Predictions`, differentiable with respect to the inputs only.
 
@@ -99,10 +99,10 @@ class Rating(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, inputs: torch.Tensor, choice: Choice | None, *parameters: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, inputs: th.Tensor, choice: Choice | None, *parameters: th.Tensor) -> th.Tensor:
         layers = len(parameters) // 2
         weights, biases = parameters[:layers], parameters[layers:]
-        slopes = torch.zeros_like(inputs) if ctx.needs_input_grad[0] else None
+        slopes = th.zeros_like(inputs) if ctx.needs_input_grad[0] else None
         ratings = []
         for start in range(0, len(inputs), RATED_ROWS):
             rows = slice(start, start + RATED_ROWS)
@@ -120,18 +120,18 @@ class Rating(torch.autograd.Function):
                     add_product_(slopes[rows], to_first, matrices[0])
         if slopes is not None:
             ctx.save_for_backward(slopes)
-        return torch.cat(ratings)
+        return th.cat(ratings)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         (slopes,) = ctx.saved_tensors
         return slopes * gradient.unsqueeze(-1), *[None] * (len(ctx.needs_input_grad) - 1)
 
 
 def _forward(
-    inputs: torch.Tensor, choice: Choice | None, weights: Tensors, biases: Tensors
-) -> tuple[list[torch.Tensor], list[list[torch.Tensor]]]:
+    inputs: th.Tensor, choice: Choice | None, weights: Tensors, biases: Tensors
+) -> tuple[list[th.Tensor], list[list[th.Tensor]]]:
     """
     :param inputs: shape ``(n, input_dim)``
     :param choice: what their one-hot vectors say
@@ -155,7 +155,7 @@ def _forward(
     return outputs, hidden
 
 
-def _backward(gradient: torch.Tensor, values: Tensors, matrices: Tensors) -> Iterator[tuple[int, torch.Tensor]]:
+def _backward(gradient: th.Tensor, values: Tensors, matrices: Tensors) -> Iterator[tuple[int, th.Tensor]]:
     """
     :param gradient: of a head's output
     :param values: what went into each of its layers
@@ -168,7 +168,7 @@ def _backward(gradient: torch.Tensor, values: Tensors, matrices: Tensors) -> Ite
             gradient = elu_gradient_(multiply(gradient, matrices[layer]), values[layer])
 
 
-def _spread(predictions: Tensors) -> tuple[list[torch.Tensor], torch.Tensor]:
+def _spread(predictions: Tensors) -> tuple[list[th.Tensor], th.Tensor]:
     """The heads' differences from their mean, and the variance."""
     mean = predictions[0] + predictions[1]
     for one in predictions[2:]:
@@ -181,7 +181,7 @@ def _spread(predictions: Tensors) -> tuple[list[torch.Tensor], torch.Tensor]:
     return differences, variance.div_(len(predictions))
 
 
-def _write_slopes(differences: Tensors, variance: torch.Tensor, weight: torch.Tensor | float, out: Tensors) -> None:
+def _write_slopes(differences: Tensors, variance: th.Tensor, weight: th.Tensor | float, out: Tensors) -> None:
     """
     :param differences: see :func:`_spread`; shape ``(n, dim)``
     :param variance: the same; overwritten
@@ -190,4 +190,4 @@ def _write_slopes(differences: Tensors, variance: torch.Tensor, weight: torch.Te
     """
     slope = weight / variance.add_(EPSILON**2).sqrt_().mul_(len(differences) * variance.shape[-1])
     for difference, one in zip(differences, out, strict=True):
-        torch.mul(difference, slope, out=one)
+        th.mul(difference, slope, out=one)

@@ -14,7 +14,7 @@ through the action at once, and through the latent behind the dreamt embedding.
 
 from typing import Any
 
-import torch
+import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
 from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
@@ -34,6 +34,8 @@ class ObservationEnsemble(ScaledUncertainty):
     :raises ValueError: for unknown metrics, fewer than two heads
     """
 
+    rotation: th.Tensor | None
+
     def __init__(
         self, sizes: LatentSizes, heads: int = 5, layers: int = 2, units: int = 400, dims: int | None = None, **scale: Any
     ) -> None:
@@ -41,47 +43,47 @@ class ObservationEnsemble(ScaledUncertainty):
         projected = dims is not None and dims < sizes.embed
         embed = dims if projected else sizes.embed
         assert embed is not None
-        rotation = torch.linalg.qr(torch.randn(sizes.embed, embed))[0] if projected else None
+        rotation = th.linalg.qr(th.randn(sizes.embed, embed))[0] if projected else None
         self.register_buffer("rotation", rotation)  # (sizes.embed, dims), orthonormal columns
         self.dream = DreamtEmbedding(sizes.feat, embed, units)
         self.ensemble = Ensemble(heads, embed + sizes.action, embed, layers, units)
-        self._rated: tuple[torch.Tensor | None, torch.Tensor | None] = None, None
+        self._rated: tuple[th.Tensor | None, th.Tensor | None] = None, None
 
-    def predict(self, transitions: Transitions) -> list[torch.Tensor]:
+    def predict(self, transitions: Transitions) -> list[th.Tensor]:
         """Predicted standardised embeddings of all heads, each of shape ``(*batch, dims)``."""
         return self.ensemble.predictions(self._inputs(transitions))
 
-    def raw(self, transitions: Transitions) -> torch.Tensor:
+    def raw(self, transitions: Transitions) -> th.Tensor:
         return self.ensemble.disagreement(self._inputs(transitions))
 
-    def _inputs(self, transitions: Transitions) -> torch.Tensor:
+    def _inputs(self, transitions: Transitions) -> th.Tensor:
         embed = None if transitions.embed is None else self._projected(transitions.embed)
-        return torch.cat((self.dream(transitions.feat, embed), transitions.action), dim=-1)
+        return th.cat((self.dream(transitions.feat, embed), transitions.action), dim=-1)
 
-    def _projected(self, embed: torch.Tensor) -> torch.Tensor:
+    def _projected(self, embed: th.Tensor) -> th.Tensor:
         """
         :param embed: shape ``(*batch, sizes.embed)``
         :return: shape ``(*batch, dims)``
         """
         return embed if self.rotation is None else embed @ self.rotation
 
-    def loss(self, transitions: Transitions) -> torch.Tensor:
+    def loss(self, transitions: Transitions) -> th.Tensor:
         assert transitions.embed is not None and transitions.next_embed is not None, "only real transitions have embeddings"
         embed, targets = (self.dream.norm(self._projected(one)) for one in (transitions.embed, transitions.next_embed))
-        predictions = self.ensemble.predictions(torch.cat((embed, transitions.action), dim=-1))
-        with torch.no_grad():
+        predictions = self.ensemble.predictions(th.cat((embed, transitions.action), dim=-1))
+        with th.no_grad():
             rows = some_of(len(embed))
             self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
         return ensemble_loss(predictions, targets) + self.dream.loss(transitions.feat, embed)
 
-    def raw_of_some(self, transitions: Transitions) -> torch.Tensor:
+    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
         """Of the transitions learnt from last, as the heads predicted then: that needs no further prediction."""
         feat, raw = self._rated
         self._rated = None, None
         return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
 
-    @torch.no_grad()
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    @th.no_grad()
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         assert transitions.next_embed is not None
         self.dream.norm.update(self._projected(transitions.next_embed))
         return super().adapt(transitions)

@@ -7,7 +7,7 @@ the encoder has never seen decoded pictures. A small head that reads the embeddi
 on the side, and differentiable, so that the actor's gradient passes through it.
 """
 
-import torch
+import torch as th
 from torch import nn
 
 from sb3_cpm.world_model.networks import MLP
@@ -25,27 +25,27 @@ class RunningNorm(nn.Module):
     :param memory: updates that the exponential average reaches back
     """
 
-    mean: torch.Tensor
-    variance: torch.Tensor
-    updates: torch.Tensor
+    mean: th.Tensor
+    variance: th.Tensor
+    updates: th.Tensor
 
     def __init__(self, size: int, bound: float = 5.0, memory: int = 100) -> None:
         super().__init__()
         self.bound, self.memory = bound, memory
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("variance", torch.ones(size))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        self.register_buffer("mean", th.zeros(size))
+        self.register_buffer("variance", th.ones(size))
+        self.register_buffer("updates", th.zeros((), dtype=th.long))
 
-    def forward(self, values: torch.Tensor) -> torch.Tensor:
+    def forward(self, values: th.Tensor) -> th.Tensor:
         standard = (values - self.mean) / (self.variance + 1e-6).sqrt()
-        return self.bound * torch.tanh(standard / self.bound)
+        return self.bound * th.tanh(standard / self.bound)
 
-    @torch.no_grad()
-    def update(self, values: torch.Tensor) -> None:
+    @th.no_grad()
+    def update(self, values: th.Tensor) -> None:
         """
         :param values: shape ``(n, size)``; a batch without any or with infinite ones changes nothing
         """
-        if not len(values) or not bool(torch.isfinite(values).all()):
+        if not len(values) or not bool(th.isfinite(values).all()):
             return
         self.updates += 1
         weight = 1.0 / min(int(self.updates), self.memory)
@@ -53,7 +53,7 @@ class RunningNorm(nn.Module):
         self.mean += weight * delta
         # within the batch, and between its mean and the running one
         spread = values.var(0, correction=0) + (1.0 - weight) * delta.square()
-        self.variance.copy_(spread if int(self.updates) == 1 else torch.lerp(self.variance, spread, weight))
+        self.variance.copy_(spread if int(self.updates) == 1 else th.lerp(self.variance, spread, weight))
 
 
 class DreamtEmbedding(nn.Module):
@@ -70,7 +70,7 @@ class DreamtEmbedding(nn.Module):
         self.norm = RunningNorm(embed_dim)
         self.head = MLP(feat_dim, 1, units, embed_dim)
 
-    def forward(self, feat: torch.Tensor, embed: torch.Tensor | None) -> torch.Tensor:
+    def forward(self, feat: th.Tensor, embed: th.Tensor | None) -> th.Tensor:
         """
         :param feat: latents, shape ``(*batch, feat_dim)``
         :param embed: what the encoder gave, shape ``(*batch, embed_dim)``; None in imagination
@@ -78,7 +78,7 @@ class DreamtEmbedding(nn.Module):
         """
         return self.head(feat) if embed is None else self.norm(embed)
 
-    def loss(self, feat: torch.Tensor, standard: torch.Tensor) -> torch.Tensor:
+    def loss(self, feat: th.Tensor, standard: th.Tensor) -> th.Tensor:
         """
         :param feat: latents, shape ``(n, feat_dim)``
         :param standard: standardised embeddings, shape ``(n, embed_dim)``

@@ -19,7 +19,7 @@ ensemble of two. So an actor that follows it seeks noise as well, which is what 
 
 from typing import Any
 
-import torch
+import torch as th
 import torch.nn.functional as F
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
@@ -72,15 +72,15 @@ class PredictionError(ScaledUncertainty):
         self.forward_model = MLP(sizes.feat + sizes.action, layers, units, output_dim)
         self.inverse_model = MLP(sizes.feat + feature_dim, layers, units, sizes.action) if self.encode is not None else None
 
-    def raw(self, transitions: Transitions) -> torch.Tensor:
+    def raw(self, transitions: Transitions) -> th.Tensor:
         """Root mean square error over the features, shape ``(*batch,)``."""
         return root((self._predict(transitions) - self._features(transitions)).square().mean(-1))
 
-    def loss(self, transitions: Transitions) -> torch.Tensor:
+    def loss(self, transitions: Transitions) -> th.Tensor:
         features = self._features(transitions)
         loss = 0.5 * (self._predict(transitions) - features.detach()).square().sum(-1).mean()
         if self.inverse_model is not None:
-            action = self.inverse_model(torch.cat((transitions.feat, features), dim=-1))
+            action = self.inverse_model(th.cat((transitions.feat, features), dim=-1))
             inverse = 0.5 * (action - transitions.action).square().sum(-1).mean()
             loss = self.forward_share * loss + (1.0 - self.forward_share) * inverse
         if self.dream is not None:
@@ -88,10 +88,10 @@ class PredictionError(ScaledUncertainty):
             loss = loss + self.dream.loss(transitions.next_feat, self.dream.norm(transitions.next_embed))
         return loss
 
-    def _predict(self, transitions: Transitions) -> torch.Tensor:
-        return self.forward_model(torch.cat((transitions.feat, transitions.action), dim=-1))
+    def _predict(self, transitions: Transitions) -> th.Tensor:
+        return self.forward_model(th.cat((transitions.feat, transitions.action), dim=-1))
 
-    def _features(self, transitions: Transitions) -> torch.Tensor:
+    def _features(self, transitions: Transitions) -> th.Tensor:
         """What shall be predicted: of the real outcome or, in imagination, of the dreamt one. Shape ``(*batch, dim)``."""
         if self.dream is not None:
             outcome = self.dream(transitions.next_feat, transitions.next_embed)
@@ -102,8 +102,8 @@ class PredictionError(ScaledUncertainty):
         features = self.encode(outcome)
         return F.layer_norm(features, features.shape[-1:])  # else their size alone could grow or shrink the error
 
-    @torch.no_grad()
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    @th.no_grad()
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         if self.dream is not None:
             assert transitions.next_embed is not None
             self.dream.norm.update(transitions.next_embed)

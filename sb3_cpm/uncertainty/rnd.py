@@ -17,7 +17,7 @@ are standardised with running statistics, which takes the largest part of that a
 
 from typing import Any
 
-import torch
+import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
 from sb3_cpm.uncertainty.parts import DreamtEmbedding, RunningNorm
@@ -61,34 +61,34 @@ class RandomNetworkDistillation(ScaledUncertainty):
         self.random = MLP(size, max(layers - 1, 1), units, output_dim).requires_grad_(False)
         self.trained = MLP(size, layers, units, output_dim)
 
-    def raw(self, transitions: Transitions) -> torch.Tensor:
+    def raw(self, transitions: Transitions) -> th.Tensor:
         """Root mean square error over the random features, shape ``(*batch,)``."""
         return root(self._error(transitions).square().mean(-1))
 
-    def loss(self, transitions: Transitions) -> torch.Tensor:
+    def loss(self, transitions: Transitions) -> th.Tensor:
         loss = 0.5 * self._error(transitions).square().sum(-1).mean()
         if self.dream is not None:
             assert transitions.next_embed is not None, "only real transitions have an embedding"
             loss = loss + self.dream.loss(transitions.next_feat, self.dream.norm(transitions.next_embed))
         return loss
 
-    def _error(self, transitions: Transitions) -> torch.Tensor:
+    def _error(self, transitions: Transitions) -> th.Tensor:
         state = self._state(transitions)
         return self.trained(state) - self.output_norm(self.random(state))
 
-    def _state(self, transitions: Transitions) -> torch.Tensor:
+    def _state(self, transitions: Transitions) -> th.Tensor:
         """The next state as both networks see it, shape ``(*batch, size)``."""
         if self.dream is not None:
             return self.dream(transitions.next_feat, transitions.next_embed)
         return self.norm(self._latent(transitions))
 
-    def _latent(self, transitions: Transitions) -> torch.Tensor:
+    def _latent(self, transitions: Transitions) -> th.Tensor:
         if self.inputs == "feat":
             return transitions.next_feat
         return transitions.next_stoch if self.inputs == "stoch" else transitions.next_deter
 
-    @torch.no_grad()
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    @th.no_grad()
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         if self.dream is not None:
             assert transitions.next_embed is not None
             self.dream.norm.update(transitions.next_embed)

@@ -8,7 +8,7 @@ nothing but "more" and "less" can share this scale, and its numbers then mean th
 import math
 from abc import abstractmethod
 
-import torch
+import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions, Uncertainty
 from sb3_cpm.world_model.networks import frozen
@@ -18,7 +18,7 @@ MOST_ROWS = 256  # of a batch tell the scale as much as all of them
 EPSILON = 1e-6  # keeps the gradient of a root finite where there is no novelty at all
 
 
-def root(mean_square: torch.Tensor) -> torch.Tensor:
+def root(mean_square: th.Tensor) -> th.Tensor:
     """Square root that is 0 at 0 with a finite gradient there."""
     return ((mean_square + EPSILON**2).sqrt() - EPSILON).clamp(min=0.0)
 
@@ -54,12 +54,12 @@ class ExpScale:
                 )
         self.mean_range, self.max_range, self.factor = tuple(mean_range), tuple(max_range), factor
 
-    def first(self, disagreement: torch.Tensor) -> float | None:
+    def first(self, disagreement: th.Tensor) -> float | None:
         """k that puts the upper quartile at 1; None if the batch says nothing."""
-        quartile = float(torch.quantile(disagreement.float(), 0.75)) if disagreement.numel() else math.nan
+        quartile = float(th.quantile(disagreement.float(), 0.75)) if disagreement.numel() else math.nan
         return self._clamp(1.0 / quartile) if math.isfinite(quartile) and quartile > 0.0 else None
 
-    def next(self, k: float, disagreement: torch.Tensor) -> float:
+    def next(self, k: float, disagreement: th.Tensor) -> float:
         """k after seeing a batch of raw novelties."""
         if not disagreement.numel():
             return k
@@ -84,16 +84,16 @@ class ScaledUncertainty(Uncertainty):
 
     :param sizes: sizes of latents and actions
     :param metric: "exp" is exp(k * d) - 1 with a dynamic scale k, at least 0; "log" is log(d), negative for d < 1
-    :param mean_range: see :class:`ExpScale`
-    :param max_range: see :class:`ExpScale`
-    :param scale_factor: see :class:`ExpScale`
+    :param mean_range: tolerated mean of k * d over a batch
+    :param max_range: tolerated maximum of k * d over a batch; wide, so that one unknown region does not flatten all others
+    :param scale_factor: by which k moves in one step, 1.5 in the report
     :param exponent_limit: beyond it, exp goes on as a straight line with the same slope: it cannot overflow, and the order of
         transitions and the gradient survive
     :raises ValueError: for an unknown metric
     """
 
-    k: torch.Tensor
-    calibrated: torch.Tensor
+    k: th.Tensor
+    calibrated: th.Tensor
 
     def __init__(
         self,
@@ -110,38 +110,38 @@ class ScaledUncertainty(Uncertainty):
         self.metric, self.exponent_limit = metric, exponent_limit
         self.nonnegative = metric == "exp"
         self.rule = ExpScale(mean_range, max_range, scale_factor)
-        self.register_buffer("k", torch.ones(()))
-        self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("k", th.ones(()))
+        self.register_buffer("calibrated", th.zeros((), dtype=th.bool))
 
     @abstractmethod
-    def raw(self, transitions: Transitions) -> torch.Tensor:
+    def raw(self, transitions: Transitions) -> th.Tensor:
         """d: how new on any scale, at least 0, in the manner of a standard deviation, shape ``(*batch,)``."""
 
-    def novelty(self, transitions: Transitions) -> torch.Tensor:
+    def novelty(self, transitions: Transitions) -> th.Tensor:
         with frozen(self):  # an actor climbs along its gradient; its own weights learn from the loss
             return self.rate(self.raw(transitions))
 
-    def rate(self, raw: torch.Tensor) -> torch.Tensor:
+    def rate(self, raw: th.Tensor) -> th.Tensor:
         """The metric: raw novelty d to novelty, shape as given."""
         if self.metric == "log":
             return (raw + EPSILON).log()
         exponent = self.k * raw
         beyond = (exponent - self.exponent_limit).clamp(min=0.0)
         bounded = exponent.clamp(max=self.exponent_limit)
-        return torch.expm1(bounded) + math.exp(self.exponent_limit) * beyond
+        return th.expm1(bounded) + math.exp(self.exponent_limit) * beyond
 
-    @torch.no_grad()
-    def adapt(self, transitions: Transitions) -> dict[str, torch.Tensor]:
+    @th.no_grad()
+    def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         raw = self.raw_of_some(transitions)
         if self.metric == "exp":
             self._adapt_scale(raw)
         return {"raw_disagreement": raw.mean(), "disagreement": self.rate(raw).mean(), "exp_scale": self.k}
 
-    def raw_of_some(self, transitions: Transitions) -> torch.Tensor:
+    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
         """d of so many transitions that they tell the scale, shape ``(rows,)``."""
         return self.raw(transitions.select(some_of(len(transitions.feat))))
 
-    def _adapt_scale(self, raw: torch.Tensor) -> None:
+    def _adapt_scale(self, raw: th.Tensor) -> None:
         if bool(self.calibrated):
             self.k.fill_(self.rule.next(float(self.k), raw))
             return

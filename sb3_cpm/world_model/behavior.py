@@ -17,7 +17,7 @@ The actor learns in one of three ways (preset entry ``actor_gradient``; Hafner e
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import torch
+import torch as th
 from torch import nn
 
 from sb3_cpm.presets import Preset
@@ -43,13 +43,13 @@ class Imagination(NamedTuple):
     :param next_feats: latents of the states 1..H, in which the actions arrive, shape ``(H, n, feat_dim)``
     """
 
-    feats: torch.Tensor
-    actions: torch.Tensor
-    entropies: torch.Tensor
-    next_feats: torch.Tensor
+    feats: th.Tensor
+    actions: th.Tensor
+    entropies: th.Tensor
+    next_feats: th.Tensor
 
 
-RewardFunction = Callable[[Imagination], torch.Tensor]
+RewardFunction = Callable[[Imagination], th.Tensor]
 
 
 class BehaviorLosses(NamedTuple):
@@ -61,11 +61,11 @@ class BehaviorLosses(NamedTuple):
     :param metrics: further numbers worth logging, detached scalars
     """
 
-    actor: torch.Tensor
+    actor: th.Tensor
     actor_gradients: Gradients
-    critic: torch.Tensor
+    critic: th.Tensor
     critic_gradients: Gradients
-    metrics: dict[str, torch.Tensor]
+    metrics: dict[str, th.Tensor]
 
 
 class Actor(nn.Module):
@@ -83,7 +83,7 @@ class Actor(nn.Module):
         super().__init__()
         self.net = MLP(feat_dim, layers, units, 2 * action_dim, one_hot)
 
-    def forward(self, feat: torch.Tensor) -> TruncatedNormal:
+    def forward(self, feat: th.Tensor) -> TruncatedNormal:
         return TruncatedNormal.of_outputs(self.net(feat))
 
 
@@ -96,7 +96,7 @@ class ActorCritic(nn.Module):
     :param one_hot: which of the latent's numbers are one-hot vectors
     """
 
-    updates: torch.Tensor
+    updates: th.Tensor
 
     def __init__(self, name: str, feat_dim: int, action_dim: int, preset: Preset, one_hot: OneHot | None = None) -> None:
         super().__init__()
@@ -108,7 +108,7 @@ class ActorCritic(nn.Module):
         if preset.slow_target:
             self.target_critic = self._make_critic(feat_dim).requires_grad_(False)
             self.target_critic.load_state_dict(self.critic.state_dict())
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        self.register_buffer("updates", th.zeros((), dtype=th.long))
 
     def _make_critic(self, feat_dim: int) -> MLP:
         return MLP(feat_dim, self.preset.critic_layers, self.preset.critic_units, 1, self.one_hot)
@@ -145,12 +145,12 @@ class ActorCritic(nn.Module):
             states.append(world_model.rssm.imagine_step(states[-1], actions[-1]))
             feats.append(states[-1].feat)
         # many small operations less than the entropies of single steps
-        policy = TruncatedNormal(*(torch.stack(part) for part in zip(*((p.loc, p.scale) for p in policies), strict=True)))
+        policy = TruncatedNormal(*(th.stack(part) for part in zip(*((p.loc, p.scale) for p in policies), strict=True)))
         return Imagination(
-            torch.stack(feats[:-1]),
-            torch.stack(actions),
+            th.stack(feats[:-1]),
+            th.stack(actions),
             policy.entropy(),
-            torch.stack(feats[1:]),
+            th.stack(feats[1:]),
         )
 
     def _learns_by_hand(self, world_model: WorldModel, start: LatentState) -> bool:
@@ -171,7 +171,7 @@ class ActorCritic(nn.Module):
         start: LatentState,
         reward: RewardFunction,
         optimizers: Mapping[str, Optimizer],
-        share: torch.Tensor | None = None,
+        share: th.Tensor | None = None,
     ) -> BehaviorLosses:
         """
         What one update of actor and critic minimises. Looks at no number on the way: a CUDA graph can hold all of it.
@@ -185,7 +185,7 @@ class ActorCritic(nn.Module):
         amp, by_hand = mixed_precision(start.deter.device, self.preset.amp), self._learns_by_hand(world_model, start)
         # what the actor learns goes through world model and slow critic, which learn nothing here; by hand nobody asks
         constant = () if by_hand else (world_model, self.target_critic)
-        with torch.set_grad_enabled(self.preset.actor_gradient != "reinforce"), frozen(*constant):
+        with th.set_grad_enabled(self.preset.actor_gradient != "reinforce"), frozen(*constant):
             with amp:
                 imagined = self.imagine(world_model, start)
             rewards = reward(imagined)  # (H, n), and so are returns, values and discounts: [i] of arriving in state i + 1
@@ -199,8 +199,8 @@ class ActorCritic(nn.Module):
                     values = self.target_critic(imagined.next_feats).float().squeeze(-1)
                 returns = lambda_returns(rewards, values, discounts, lambda_)
         # state i is reached with this probability: what lies behind an imagined end of the episode counts for nothing
-        reached = torch.cumprod(torch.cat((torch.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()  # (H, n)
-        share = torch.ones_like(reached[0]) if share is None else share  # (n,)
+        reached = th.cumprod(th.cat((th.ones_like(discounts[:1]), discounts[:-1])), dim=0).detach()  # (H, n)
+        share = th.ones_like(reached[0]) if share is None else share  # (n,)
         weight = reached * share  # (H, n)
 
         objective, entropies = self._objective(imagined, returns, values)
@@ -214,11 +214,11 @@ class ActorCritic(nn.Module):
     def _critic_loss(
         self,
         imagined: Imagination,
-        returns: torch.Tensor,
-        weight: torch.Tensor,
+        returns: th.Tensor,
+        weight: th.Tensor,
         optimizers: Mapping[str, Optimizer],
         by_hand: bool,
-    ) -> tuple[torch.Tensor, Gradients]:
+    ) -> tuple[th.Tensor, Gradients]:
         """
         :param imagined: what the actor did
         :param returns: of each action, shape ``(H, n)``
@@ -237,7 +237,7 @@ class ActorCritic(nn.Module):
         loss = (weight * 0.5 * (predicted - returns).square()).mean()
         return loss, optimizers[f"{self.name}_critic"].gradients(loss)
 
-    def step(self, losses: BehaviorLosses, optimizers: Mapping[str, Optimizer]) -> dict[str, torch.Tensor]:
+    def step(self, losses: BehaviorLosses, optimizers: Mapping[str, Optimizer]) -> dict[str, th.Tensor]:
         """
         One update of actor and critic.
 
@@ -252,9 +252,7 @@ class ActorCritic(nn.Module):
         metrics |= {"actor_grad_norm": actor_norm, "critic_grad_norm": critic_norm, **losses.metrics}
         return {f"{self.name}_{key}": value for key, value in metrics.items()}
 
-    def _objective(
-        self, imagined: Imagination, returns: torch.Tensor, values: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _objective(self, imagined: Imagination, returns: th.Tensor, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         What the actor climbs, and its entropies, each of shape ``(H, n)``.
 
@@ -268,8 +266,8 @@ class ActorCritic(nn.Module):
         feats = imagined.feats.detach()
         with mixed_precision(feats.device, self.preset.amp):
             policy = self.actor(feats)
-        with torch.no_grad():
-            baseline = torch.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))  # of states 0..H-1, (H, n)
+        with th.no_grad():
+            baseline = th.cat((self.target_critic(feats[:1]).squeeze(-1), values[:-1]))  # of states 0..H-1, (H, n)
             advantage = returns - baseline
         reinforce = policy.log_prob(imagined.actions.detach()) * advantage
         if kind == "reinforce":

@@ -9,7 +9,7 @@ to: every single action has the distribution that the actor gave.
 import math
 
 import numpy as np
-import torch
+import torch as th
 
 
 class CorrelatedNoise:
@@ -21,7 +21,7 @@ class CorrelatedNoise:
     :param device: where they are needed
     """
 
-    def __init__(self, memory: float, dim: int, device: torch.device) -> None:
+    def __init__(self, memory: float, dim: int, device: th.device) -> None:
         self.kept = math.exp(-1.0 / memory) if memory > 0.0 else 0.0
         self.dim, self.device = dim, device
         self._last = np.zeros((0, dim), dtype=np.float32)
@@ -34,17 +34,17 @@ class CorrelatedNoise:
         self._make_room_for(envs)
         self._fresh[envs] = True
 
-    def draw(self, envs: np.ndarray) -> torch.Tensor:
+    def draw(self, envs: np.ndarray) -> th.Tensor:
         """
         :param envs: indices of the environments that act
         :return: shape ``(len(envs), dim)``
         """
         self._make_room_for(envs)
         kept = np.where(self._fresh[envs], 0.0, self.kept)[:, None]
-        news = torch.randn(len(envs), self.dim).numpy()  # on the CPU, whatever the device: one seed, one run
+        news = th.randn(len(envs), self.dim).numpy()  # on the CPU, whatever the device: one seed, one run
         self._last[envs] = kept * self._last[envs] + np.sqrt(1.0 - kept**2) * news
         self._fresh[envs] = False
-        return torch.as_tensor(self._last[envs], device=self.device)
+        return th.as_tensor(self._last[envs], device=self.device)
 
     def _make_room_for(self, envs: np.ndarray) -> None:
         missing = int(np.max(envs, initial=-1)) + 1 - len(self._last)

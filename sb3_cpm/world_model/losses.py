@@ -2,14 +2,14 @@
 
 from typing import Any
 
-import torch
+import torch as th
 from torch.autograd.function import once_differentiable
 
 from sb3_cpm.world_model.distributions import Latent
 from sb3_cpm.world_model.fast.acceleration import cache_slices
 
 
-def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
     """
     Mean over the entries where ``mask`` is True; 0 where there are none.
 
@@ -21,7 +21,7 @@ def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     return values.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
 
 
-def squared_error(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+def squared_error(prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
     """
     Negative log-likelihood of a unit-variance Gaussian without its constant, summed over all but the first dimension.
 
@@ -31,30 +31,30 @@ def squared_error(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tenso
     return _SquaredError.apply(prediction, target)
 
 
-class _SquaredError(torch.autograd.Function):
+class _SquaredError(th.autograd.Function):
     """:func:`squared_error` by hand: images are read and written in slices that fit into the cache, not once per operation."""
 
     @staticmethod
-    def forward(ctx: Any, prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, prediction: th.Tensor, target: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(prediction, target)
         dims = tuple(range(1, prediction.dim()))
         squares = [(one - other).square_() for one, other in cache_slices(prediction, target)]
-        return 0.5 * torch.cat([one.sum(dims) if dims else one for one in squares])
+        return 0.5 * th.cat([one.sum(dims) if dims else one for one in squares])
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, None]:
         prediction, target = ctx.saved_tensors
-        result = torch.empty_like(prediction)
+        result = th.empty_like(prediction)
         factors = gradient.reshape(-1, *[1] * (prediction.dim() - 1))
         for out, one, other, factor in cache_slices(result, prediction, target, factors):
-            torch.sub(one, other, out=out).mul_(factor)
+            th.sub(one, other, out=out).mul_(factor)
         return result, None
 
 
 def balanced_kl(
-    latent: Latent, posterior: torch.Tensor, prior: torch.Tensor, mask: torch.Tensor, balance: float, free_nats: float
-) -> tuple[torch.Tensor, torch.Tensor]:
+    latent: Latent, posterior: th.Tensor, prior: th.Tensor, mask: th.Tensor, balance: float, free_nats: float
+) -> tuple[th.Tensor, th.Tensor]:
     """
     KL loss that moves the prior towards the posterior faster than the other way round (DreamerV2, algorithm 2).
 
@@ -73,7 +73,7 @@ def balanced_kl(
     return loss, prior_side.detach()
 
 
-def lambda_returns(rewards: torch.Tensor, values: torch.Tensor, discounts: torch.Tensor, lambda_: float) -> torch.Tensor:
+def lambda_returns(rewards: th.Tensor, values: th.Tensor, discounts: th.Tensor, lambda_: float) -> th.Tensor:
     """
     TD(lambda) targets: G_i = r_i + d_i * ((1 - lambda) * v_i + lambda * G_{i+1}), with the last v instead of G behind the end.
 
@@ -91,4 +91,4 @@ def lambda_returns(rewards: torch.Tensor, values: torch.Tensor, discounts: torch
     for i in reversed(range(len(rewards))):
         carry = inputs[i] + lambda_ * discounts[i] * carry
         returns.append(carry)
-    return torch.stack(returns[::-1])
+    return th.stack(returns[::-1])

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import NamedTuple
 
-import torch
+import torch as th
 from torch import nn
 
 from sb3_cpm.world_model.fast.activation import ELU
@@ -24,7 +24,7 @@ CACHED_NUMBERS = 2**21  # of a feature map that several operations find in the c
 
 def channels_last(module: nn.Sequential) -> nn.Sequential:
     """Store the weights of convolutions as the images come, channels last."""
-    return module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
+    return module.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
 
 
 class MLP(nn.Sequential):
@@ -50,7 +50,7 @@ class MLP(nn.Sequential):
         super().__init__(*modules)
         self.output_dim = input_dim if output_dim is None else output_dim
 
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
         :param inputs: shape ``(*batch, input_dim)``
         :return: shape ``(*batch, output_dim)``
@@ -75,12 +75,12 @@ class GRUCell(nn.Module):
         # after a reset memory, state and action are all zero: a smaller eps would blow up the gradient there
         self.norm = nn.LayerNorm(3 * size, eps=1e-3)
 
-    def forward(self, inputs: torch.Tensor, hidden: torch.Tensor) -> torch.Tensor:
+    def forward(self, inputs: th.Tensor, hidden: th.Tensor) -> th.Tensor:
         # float(): does nothing, unless mixed precision is on, whose rounding must not accumulate in the memory
-        gates = self.norm(self.gates(torch.cat((inputs, hidden), dim=-1)).float()).float()
+        gates = self.norm(self.gates(th.cat((inputs, hidden), dim=-1)).float()).float()
         reset, candidate, update = gates.chunk(3, dim=-1)
-        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        return torch.lerp(hidden, candidate, torch.sigmoid(update + self.update_bias))
+        candidate = th.tanh(th.sigmoid(reset) * candidate)
+        return th.lerp(hidden, candidate, th.sigmoid(update + self.update_bias))
 
 
 class Pyramid(NamedTuple):
@@ -116,7 +116,7 @@ class Pyramid(NamedTuple):
         return self.height // 2**self.layers, self.width // 2**self.layers
 
 
-def convolve(convolutions: nn.Sequential, inputs: torch.Tensor, largest: int) -> torch.Tensor:
+def convolve(convolutions: nn.Sequential, inputs: th.Tensor, largest: int) -> th.Tensor:
     """
     Apply convolutions; on CPUs to as many images at a time as their feature maps fit into a cache.
 
@@ -127,7 +127,7 @@ def convolve(convolutions: nn.Sequential, inputs: torch.Tensor, largest: int) ->
     rows = max(CACHED_NUMBERS // largest, 1)
     if inputs.device.type != "cpu" or len(inputs) <= rows:
         return convolutions(inputs)
-    return torch.cat([convolutions(part) for part in inputs.split(rows)])
+    return th.cat([convolutions(part) for part in inputs.split(rows)])
 
 
 class ConvEncoder(nn.Module):
@@ -158,7 +158,7 @@ class ConvEncoder(nn.Module):
         self.output_dim = channels * pyramid.smallest[0] * pyramid.smallest[1]
         self.largest = depth * pyramid.height * pyramid.width // 4
 
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
+    def forward(self, images: th.Tensor) -> th.Tensor:
         if self.padding is not None:
             images = nn.functional.pad(images, self.padding)
         return convolve(self.convolutions, images, self.largest).flatten(1)
@@ -192,12 +192,12 @@ class ConvDecoder(nn.Module):
         self.convolutions = channels_last(nn.Sequential(*modules, Deconvolution(widths[-1], channels)))
         self.largest = depth * pyramid.height * pyramid.width // 4
 
-    def forward(self, feat: torch.Tensor) -> torch.Tensor:
+    def forward(self, feat: th.Tensor) -> th.Tensor:
         features = self.linear(feat).unflatten(1, self.feature_map)
-        drawn = convolve(self.convolutions, features.contiguous(memory_format=torch.channels_last), self.largest)
+        drawn = convolve(self.convolutions, features.contiguous(memory_format=th.channels_last), self.largest)
         if self.cut is None:
             return drawn
-        return drawn[:, :, : self.cut[0], : self.cut[1]].contiguous(memory_format=torch.channels_last)
+        return drawn[:, :, : self.cut[0], : self.cut[1]].contiguous(memory_format=th.channels_last)
 
 
 class Encoder(nn.Module):
@@ -217,13 +217,13 @@ class Encoder(nn.Module):
         self.mlp = None if spec.vector_dim == 0 else MLP(spec.vector_dim, vector_layers, vector_units)
         self.output_dim = sum(part.output_dim for part in (self.cnn, self.mlp) if part is not None)
 
-    def forward(self, inputs: Inputs) -> torch.Tensor:
+    def forward(self, inputs: Inputs) -> th.Tensor:
         parts = []
         if self.cnn is not None:
             parts.append(self.cnn(inputs.images))
         if self.mlp is not None:
             parts.append(self.mlp(inputs.vectors))
-        return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+        return th.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
 
 class Decoder(nn.Module):
@@ -254,7 +254,7 @@ class Decoder(nn.Module):
         vector = (feat_dim, vector_layers, vector_units, spec.vector_dim, one_hot)
         self.mlp = None if spec.vector_dim == 0 else MLP(*vector)
 
-    def forward(self, feat: torch.Tensor) -> Inputs:
+    def forward(self, feat: th.Tensor) -> Inputs:
         return Inputs(
             images=None if self.cnn is None else self.cnn(feat), vectors=None if self.mlp is None else self.mlp(feat)
         )

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
+import torch as th
 from gymnasium import spaces
 
 from sb3_cpm.spaces import is_cloud, is_vector, looks_like_cloud
@@ -18,21 +18,21 @@ from sb3_cpm.world_model.fast.acceleration import cache_slices
 MIN_FEATURE_MAP = 2  # the smallest feature map of the CNN, pixels per side
 
 
-def symlog(x: torch.Tensor) -> torch.Tensor:
+def symlog(x: th.Tensor) -> th.Tensor:
     """Logarithm that keeps sign and small values (Hafner et al. 2023, eq. 9): the range of a vector is rarely known."""
-    return torch.sign(x) * torch.log1p(torch.abs(x))
+    return th.sign(x) * th.log1p(th.abs(x))
 
 
-def symexp(x: torch.Tensor) -> torch.Tensor:
+def symexp(x: th.Tensor) -> th.Tensor:
     """Inverse of ``symlog``."""
-    return torch.sign(x) * torch.expm1(torch.abs(x))
+    return th.sign(x) * th.expm1(th.abs(x))
 
 
-def to_tensor(array: np.ndarray | torch.Tensor, device: torch.device) -> torch.Tensor:
+def to_tensor(array: np.ndarray | th.Tensor, device: th.device) -> th.Tensor:
     """Onto the device, without a copy where possible; torch warns about read-only arrays, so those are copied."""
     if isinstance(array, np.ndarray) and not array.flags.writeable:
         array = array.copy()
-    return torch.as_tensor(array, device=device)
+    return th.as_tensor(array, device=device)
 
 
 class Inputs(NamedTuple):
@@ -43,8 +43,8 @@ class Inputs(NamedTuple):
     :param vectors: all vectors side by side, shape ``(n, vector_dim)``, or None
     """
 
-    images: torch.Tensor | None
-    vectors: torch.Tensor | None
+    images: th.Tensor | None
+    vectors: th.Tensor | None
 
     def float(self) -> "Inputs":
         """The same in float32, where mixed precision computed them."""
@@ -149,7 +149,7 @@ class ObservationSpec:
         shape = self.shapes[key]
         return (shape[1], shape[2]) if self._channel_first(key) else (shape[0], shape[1])
 
-    def preprocess(self, observations: Mapping[str, np.ndarray | torch.Tensor], device: torch.device) -> Inputs:
+    def preprocess(self, observations: Mapping[str, np.ndarray | th.Tensor], device: th.device) -> Inputs:
         """
         Raw observations to network inputs; the arrays that come in are not touched.
 
@@ -163,22 +163,20 @@ class ObservationSpec:
         if self.image_keys:
             # (n, H, W, C) all along: seen as (n, C, H, W) that is PyTorch's channels-last format, fast in convolutions
             stacked = [self.channels_last(key, self._scaled(key, tensors[key])) for key in self.image_keys]
-            joined = torch.cat(stacked, dim=-1) if len(stacked) > 1 else stacked[0].contiguous()
+            joined = th.cat(stacked, dim=-1) if len(stacked) > 1 else stacked[0].contiguous()
             images = joined.permute(0, 3, 1, 2).float()
             images = images.div_(255.0).sub_(0.5) if self.scaled_alike else images
         if self.vector_keys:
-            vectors = torch.cat([tensors[key].flatten(1).float() for key in self.vector_keys], dim=-1)
+            vectors = th.cat([tensors[key].flatten(1).float() for key in self.vector_keys], dim=-1)
             if self.squash:
                 vectors = symlog(vectors)
         return Inputs(images, vectors)
 
-    def _flat_batch(
-        self, key: str, observations: Mapping[str, np.ndarray | torch.Tensor], device: torch.device
-    ) -> torch.Tensor:
+    def _flat_batch(self, key: str, observations: Mapping[str, np.ndarray | th.Tensor], device: th.device) -> th.Tensor:
         if key not in observations:
             raise ValueError(f"Observation key {key!r} is missing, got {sorted(observations)}.")
         tensor = to_tensor(observations[key], device)
-        if tensor.dtype == torch.float64 and bool((tensor.isfinite() != tensor.float().isfinite()).any()):
+        if tensor.dtype == th.float64 and bool((tensor.isfinite() != tensor.float().isfinite()).any()):
             raise ValueError(
                 f"Observation {key!r} holds {tensor.abs().amax():.3g}, beyond float32, in which networks compute. Scale it in "
                 "a wrapper, for example with gymnasium's TransformObservation."
@@ -189,7 +187,7 @@ class ObservationSpec:
                 f"Observation {key!r} has shape {tuple(tensor.shape)}, expected it to end in {shape}: the observation space "
                 "is not the one that the challenger was built for."
             )
-        if self.dtypes.get(key) == "uint8" and tensor.dtype != torch.uint8:
+        if self.dtypes.get(key) == "uint8" and tensor.dtype != th.uint8:
             low, high = self.ranges[key]
             raise ValueError(
                 f"Image {key!r} came as {tensor.dtype}, its space declares uint8 from {low:g} to {high:g}. Has a wrapper "
@@ -197,7 +195,7 @@ class ObservationSpec:
             )
         return tensor.reshape(-1, *shape)
 
-    def _scaled(self, key: str, image: torch.Tensor) -> torch.Tensor:
+    def _scaled(self, key: str, image: th.Tensor) -> th.Tensor:
         """An image in [-0.5, 0.5], or untouched where all are uint8 and can be scaled at once."""
         if self.scaled_alike:
             return image
@@ -212,7 +210,7 @@ class ObservationSpec:
                 )
         return ((image - low) / (high - low) - 0.5).clamp_(-0.5, 0.5)
 
-    def channels_last(self, key: str, images: torch.Tensor) -> torch.Tensor:
+    def channels_last(self, key: str, images: th.Tensor) -> th.Tensor:
         """
         :param key: an image key
         :param images: as the space has them, shape ``(*batch, *observation_shape)``
@@ -220,7 +218,7 @@ class ObservationSpec:
         """
         return images.movedim(-3, -1) if self._channel_first(key) else images
 
-    def errors(self, decoded: Inputs, truth: Inputs) -> Iterator[tuple[str, torch.Tensor]]:
+    def errors(self, decoded: Inputs, truth: Inputs) -> Iterator[tuple[str, th.Tensor]]:
         """
         Mean absolute error of every key, shape ``(n,)``: of images on the scale of [-0.5, 0.5], of vectors as they enter the
         networks (after ``symlog``).
@@ -230,13 +228,13 @@ class ObservationSpec:
         """
         if decoded.images is not None and truth.images is not None:
             pairs = cache_slices(decoded.images, truth.images)
-            parts = torch.cat([(one - other).abs_().mean((2, 3)) for one, other in pairs]).split(self.channels, dim=1)
+            parts = th.cat([(one - other).abs_().mean((2, 3)) for one, other in pairs]).split(self.channels, dim=1)
             yield from zip(self.image_keys, (part.mean(1) for part in parts), strict=True)
         if decoded.vectors is not None and truth.vectors is not None:
             parts = (decoded.vectors - truth.vectors).abs().split(self.vector_sizes, dim=1)
             yield from zip(self.vector_keys, (part.mean(1) for part in parts), strict=True)
 
-    def split(self, inputs: Inputs, batch: Sequence[int]) -> dict[str, torch.Tensor]:
+    def split(self, inputs: Inputs, batch: Sequence[int]) -> dict[str, th.Tensor]:
         """
         The inverse of :meth:`preprocess`, for decoded observations: one float tensor per key, images in their space's range.
 
@@ -246,7 +244,7 @@ class ObservationSpec:
         """
         result = {}
         if inputs.images is not None:
-            cameras = torch.split((inputs.images + 0.5).clamp(0.0, 1.0), self.channels, dim=1)
+            cameras = th.split((inputs.images + 0.5).clamp(0.0, 1.0), self.channels, dim=1)
             for key, camera in zip(self.image_keys, cameras, strict=True):
                 low, high = self.ranges[key]
                 camera = camera * (high - low) + low
@@ -254,7 +252,7 @@ class ObservationSpec:
                 result[key] = camera.reshape(*batch, *self.shapes[key])
         if inputs.vectors is not None:
             vectors = symexp(inputs.vectors) if self.squash else inputs.vectors
-            for key, vector in zip(self.vector_keys, torch.split(vectors, self.vector_sizes, dim=-1), strict=True):
+            for key, vector in zip(self.vector_keys, th.split(vectors, self.vector_sizes, dim=-1), strict=True):
                 result[key] = vector.reshape(*batch, *self.shapes[key])
         return result
 

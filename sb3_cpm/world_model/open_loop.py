@@ -8,7 +8,7 @@ it (that is its reconstruction); after it only the actions are known to it.
 from typing import NamedTuple
 
 import numpy as np
-import torch
+import torch as th
 
 from sb3_cpm.world_model.observations import Inputs
 from sb3_cpm.world_model.rssm import LatentState
@@ -29,8 +29,8 @@ class OpenLoop(NamedTuple):
     context: int
 
 
-@torch.no_grad()
-def open_loop(model: WorldModel, inputs: Inputs, actions: torch.Tensor, context: int) -> OpenLoop:
+@th.no_grad()
+def open_loop(model: WorldModel, inputs: Inputs, actions: th.Tensor, context: int) -> OpenLoop:
     """
     :param model: the world model; modes only, so no random numbers
     :param inputs: preprocessed observations of the context, or of more rows, of one episode from its first state on
@@ -38,8 +38,8 @@ def open_loop(model: WorldModel, inputs: Inputs, actions: torch.Tensor, context:
     :param context: rows to look at
     """
     embed = model.encoder(Inputs(*(None if part is None else part[:context] for part in inputs))).unsqueeze(1)
-    led_here = torch.cat((torch.zeros_like(actions[:1]), actions[: context - 1])).unsqueeze(1)
-    first = torch.zeros(context, 1, dtype=torch.bool, device=actions.device)
+    led_here = th.cat((th.zeros_like(actions[:1]), actions[: context - 1])).unsqueeze(1)
+    first = th.zeros(context, 1, dtype=th.bool, device=actions.device)
     first[0] = True
     seen = model.rssm.observe(embed, led_here, first, deterministic=True)
     state = LatentState(*(part[-1] for part in seen))
@@ -47,7 +47,7 @@ def open_loop(model: WorldModel, inputs: Inputs, actions: torch.Tensor, context:
     for action in actions[context - 1 :]:
         state = model.rssm.imagine_step(state, action.unsqueeze(0), deterministic=True)
         feats.append(state.feat.unsqueeze(0))
-    feat = torch.cat(feats).squeeze(1)
+    feat = th.cat(feats).squeeze(1)
     drawn = model.spec.split(model.decoder(feat), (len(feat),))
     rewards = model.reward(feat[1:])
     return OpenLoop({key: value.cpu().numpy() for key, value in drawn.items()}, rewards.cpu().numpy(), context)

@@ -5,11 +5,11 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import torch
+import torch as th
 from torch import nn
 
 #: Of every parameter, None where the loss does not depend on it.
-Gradients = tuple[torch.Tensor | None, ...]
+Gradients = tuple[th.Tensor | None, ...]
 
 
 class Optimizer:
@@ -35,8 +35,8 @@ class Optimizer:
         named = [item for module in modules for item in module.named_parameters() if item[1].requires_grad]
         self.name, self.clip, self.weight_decay = name, clip, weight_decay
         self.parameters = [parameter for _, parameter in named]
-        self.decayed: list[torch.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
-        self.adam = torch.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
+        self.decayed: list[th.Tensor] = [parameter for key, parameter in named if parameter.dim() > 1 and "bias" not in key]
+        self.adam = th.optim.Adam(self.parameters, lr=learning_rate, eps=eps, fused=True)
 
     @property
     def learning_rate(self) -> float:
@@ -48,14 +48,14 @@ class Optimizer:
         for group in self.adam.param_groups:
             group["lr"] = rate
 
-    def gradients(self, loss: torch.Tensor) -> Gradients:
+    def gradients(self, loss: th.Tensor) -> Gradients:
         """
         :param loss: scalar
         :return: of this optimizer's parameters; none is computed for any other
         """
-        return torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        return th.autograd.grad(loss, self.parameters, allow_unused=True)
 
-    def step(self, loss: torch.Tensor, gradients: Gradients | None = None) -> torch.Tensor:
+    def step(self, loss: th.Tensor, gradients: Gradients | None = None) -> th.Tensor:
         """
         One update, for this optimizer's parameters only: no gradient is left at any other.
 
@@ -76,12 +76,12 @@ class Optimizer:
             self.adam.zero_grad(set_to_none=True)
             raise RuntimeError(f"The gradient of the {self.name} loss ({loss.item():.4g}) became {size}. {ADVICE}")
         if size > self.clip:
-            torch._foreach_mul_(used, self.clip / (size + 1e-6))
+            th._foreach_mul_(used, self.clip / (size + 1e-6))
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         if self.weight_decay and self.decayed:
-            with torch.no_grad():
-                torch._foreach_mul_(self.decayed, 1.0 - self.weight_decay)
+            with th.no_grad():
+                th._foreach_mul_(self.decayed, 1.0 - self.weight_decay)
         return norm
 
     def adopt(self, other: "Optimizer") -> None:

@@ -14,7 +14,7 @@ States are float32 even where mixed precision computes them: a memory that is ro
 
 from typing import NamedTuple
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch import nn
 
@@ -36,14 +36,14 @@ class LatentState(NamedTuple):
     :param stats: parameters of the distribution that ``stoch`` was drawn from, shape ``(*batch, stats_size)``
     """
 
-    deter: torch.Tensor
-    stoch: torch.Tensor
-    stats: torch.Tensor
+    deter: th.Tensor
+    stoch: th.Tensor
+    stats: th.Tensor
 
     @property
-    def feat(self) -> torch.Tensor:
+    def feat(self) -> th.Tensor:
         """The whole latent, what heads and actors read, shape ``(*batch, feat_dim)``."""
-        return torch.cat((self.stoch, self.deter), dim=-1)
+        return th.cat((self.stoch, self.deter), dim=-1)
 
     def detach(self) -> "LatentState":
         return LatentState(*(part.detach() for part in self))
@@ -52,7 +52,7 @@ class LatentState(NamedTuple):
         """All batch dimensions in one."""
         return LatentState(*(part.flatten(0, -2) for part in self))
 
-    def select(self, index: torch.Tensor) -> "LatentState":
+    def select(self, index: th.Tensor) -> "LatentState":
         """Rows of the first batch dimension."""
         return LatentState(*(part[index] for part in self))
 
@@ -79,7 +79,7 @@ class RSSM(nn.Module):
         self.posterior_embed = Linear(embed_dim, hidden_size, bias=False)
         self.posterior_out = Linear(hidden_size, latent.stats_size)
 
-    def forward(self, stoch: torch.Tensor, action_in: torch.Tensor, deter: torch.Tensor) -> torch.Tensor:
+    def forward(self, stoch: th.Tensor, action_in: th.Tensor, deter: th.Tensor) -> th.Tensor:
         """
         One step of the memory, what all sequences are made of (``torch.compile`` takes hold here).
 
@@ -94,14 +94,14 @@ class RSSM(nn.Module):
         """Zeros for ``n`` environments."""
         like = self.input_stoch.weight
         sizes = (self.deter_size, self.latent.size, self.latent.stats_size)
-        return LatentState(*(torch.zeros(n, size, device=like.device, dtype=like.dtype) for size in sizes))
+        return LatentState(*(th.zeros(n, size, device=like.device, dtype=like.dtype) for size in sizes))
 
     def observe(
         self,
-        embed: torch.Tensor,
-        actions: torch.Tensor,
-        is_first: torch.Tensor,
-        mask: torch.Tensor | None = None,
+        embed: th.Tensor,
+        actions: th.Tensor,
+        is_first: th.Tensor,
+        mask: th.Tensor | None = None,
         state: LatentState | None = None,
         deterministic: bool = False,
     ) -> LatentState:
@@ -142,22 +142,22 @@ class RSSM(nn.Module):
             if mask is not None and gaps is not None and gaps[t]:
                 here = mask[t].unsqueeze(-1)
                 deter, stoch, stats = (
-                    torch.where(here, new, old) for new, old in zip((deter, stoch, stats), before, strict=True)
+                    th.where(here, new, old) for new, old in zip((deter, stoch, stats), before, strict=True)
                 )
             rows.append(LatentState(deter, stoch, stats))
-        return LatentState(*(torch.stack(parts) for parts in zip(*rows, strict=True)))
+        return LatentState(*(th.stack(parts) for parts in zip(*rows, strict=True)))
 
-    def _trains_by_hand(self, embed_in: torch.Tensor) -> bool:
+    def _trains_by_hand(self, embed_in: th.Tensor) -> bool:
         """Where there is a gradient to compute, and torch.compile does not have the step."""
         return embed_in.requires_grad and not is_compiled(self)
 
     def _scan(
         self,
         state: LatentState,
-        noise: torch.Tensor,
-        first: torch.Tensor,
-        actions_in: torch.Tensor,
-        embed_in: torch.Tensor,
+        noise: th.Tensor,
+        first: th.Tensor,
+        actions_in: th.Tensor,
+        embed_in: th.Tensor,
     ) -> LatentState:
         """
         What :meth:`observe` computes step by step, with the gradient by hand; in float32 also in mixed precision, since the
@@ -174,14 +174,14 @@ class RSSM(nn.Module):
             self.posterior_out.bias,
         )
         actions_in, embed_in = actions_in + self.input_stoch.bias, embed_in + self.posterior_deter.bias
-        with torch.autocast(embed_in.device.type, enabled=False):
+        with th.autocast(embed_in.device.type, enabled=False):
             return LatentState(*Scan.apply(settings, noise, first, state.deter, state.stoch, actions_in, embed_in, *weights))
 
-    def prior(self, deter: torch.Tensor) -> torch.Tensor:
+    def prior(self, deter: th.Tensor) -> th.Tensor:
         """Parameters of the prior that belongs to a deterministic state, shape ``(*batch, stats_size)``."""
         return self.prior_net(deter).float()
 
-    def imagine_step(self, state: LatentState, action: torch.Tensor, deterministic: bool = False) -> LatentState:
+    def imagine_step(self, state: LatentState, action: th.Tensor, deterministic: bool = False) -> LatentState:
         """
         One step without an observation.
 
@@ -204,9 +204,9 @@ class RSSM(nn.Module):
         assert isinstance(hidden_layer, nn.Linear) and isinstance(output_layer, nn.Linear)
         return Dynamics(
             self.latent,
-            torch.cat((self.input_action.weight, self.input_stoch.weight), dim=1),
+            th.cat((self.input_action.weight, self.input_stoch.weight), dim=1),
             self.input_stoch.bias,
-            torch.cat((gates[:, hidden:], gates[:, :hidden]), dim=1),  # the cell itself reads its input first
+            th.cat((gates[:, hidden:], gates[:, :hidden]), dim=1),  # the cell itself reads its input first
             self.gru.norm.weight,
             self.gru.norm.bias,
             self.gru.norm.eps,

@@ -2,10 +2,9 @@
 The world model: encoder, RSSM, decoders, reward head and continue head, trained together (report, B.1; Hafner et al. 2021).
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch import nn
 
@@ -15,29 +14,6 @@ from sb3_cpm.world_model.losses import balanced_kl, masked_mean, squared_error
 from sb3_cpm.world_model.networks import MLP, Decoder, Encoder
 from sb3_cpm.world_model.observations import Inputs, ObservationSpec, symexp, symlog
 from sb3_cpm.world_model.rssm import RSSM, LatentState
-
-LONGEST_KEY = 27  # SB3 prints 36 characters of a name: 3 to indent it, "error_", and what is left
-
-
-def short_names(keys: Sequence[str]) -> dict[str, str]:
-    """
-    Names for the log that differ from each other also where SB3 prints only their beginning.
-
-    :param keys: of observations
-    :return: keys of up to ``LONGEST_KEY`` characters as they are, of longer ones beginning and end; where two would look the
-        same, numbers tell them apart
-    """
-    names = {key: key for key in keys if len(key) <= LONGEST_KEY}
-    for key in keys:
-        number = 1
-        while key not in names:
-            mark = "..." if number == 1 else f"..{number}.."
-            left = LONGEST_KEY - len(mark)
-            name = key[: left // 3] + mark + key[-(left - left // 3) :]
-            number += 1
-            if name not in names.values():
-                names[key] = name
-    return names
 
 
 class Sequences(NamedTuple):
@@ -53,11 +29,11 @@ class Sequences(NamedTuple):
     """
 
     inputs: Inputs
-    actions: torch.Tensor
-    rewards: torch.Tensor
-    is_first: torch.Tensor
-    is_terminal: torch.Tensor
-    mask: torch.Tensor
+    actions: th.Tensor
+    rewards: th.Tensor
+    is_first: th.Tensor
+    is_terminal: th.Tensor
+    mask: th.Tensor
 
 
 class WorldModelOutput(NamedTuple):
@@ -68,15 +44,15 @@ class WorldModelOutput(NamedTuple):
     :param embed: encoder outputs of all rows, shape ``(L, n, embed_dim)``, detached
     """
 
-    losses: dict[str, torch.Tensor]
-    metrics: dict[str, torch.Tensor]
+    losses: dict[str, th.Tensor]
+    metrics: dict[str, th.Tensor]
     posterior: LatentState
-    embed: torch.Tensor
+    embed: th.Tensor
 
     @property
-    def total(self) -> torch.Tensor:
+    def total(self) -> th.Tensor:
         """What is minimised, a scalar."""
-        return torch.stack(list(self.losses.values())).sum()
+        return th.stack(list(self.losses.values())).sum()
 
 
 def make_latent(preset: Preset) -> Latent:
@@ -96,8 +72,6 @@ class WorldModel(nn.Module):
     def __init__(self, spec: ObservationSpec, action_dim: int, preset: Preset) -> None:
         super().__init__()
         self.spec, self.action_dim, self.preset = spec, action_dim, preset
-        #: what the reconstruction error of each key is called in the log
-        self.error_names = {key: f"error_{name}" for key, name in short_names(spec.keys).items()}
         vector = (preset.vector_layers, preset.vector_units)
         cnn = (preset.cnn_depth, preset.cnn_layers)
         self.encoder = Encoder(spec, *cnn, *vector)
@@ -131,9 +105,7 @@ class WorldModel(nn.Module):
         metrics.update(errors)
         return WorldModelOutput(losses, metrics, posterior.detach(), embed.detach())
 
-    def _reconstruction_losses(
-        self, feat: torch.Tensor, batch: Sequences
-    ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    def _reconstruction_losses(self, feat: th.Tensor, batch: Sequences) -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
         losses, metrics = {}, {}
         decoded = self.decoder(feat.flatten(0, 1)).float()
         mask = batch.mask.flatten()
@@ -141,15 +113,15 @@ class WorldModel(nn.Module):
             losses["image"] = masked_mean(squared_error(decoded.images, batch.inputs.images), mask)
         if decoded.vectors is not None and batch.inputs.vectors is not None:
             losses["vector"] = masked_mean(squared_error(decoded.vectors, batch.inputs.vectors), mask)
-        with torch.no_grad():
+        with th.no_grad():
             errors = {key: masked_mean(one, mask) for key, one in self.spec.errors(decoded, batch.inputs)}
-            metrics.update({self.error_names[key]: value for key, value in errors.items()})
+            metrics.update({f"error_{key}": value for key, value in errors.items()})
         if decoded.images is not None:  # the report's measure of Fig. 10b, on the scale of [-0.5, 0.5]
             cameras = zip(self.spec.image_keys, self.spec.channels, strict=True)
-            metrics["pixel_error"] = torch.stack([n * errors[key] for key, n in cameras]).sum() / len(decoded.images[0])
+            metrics["pixel_error"] = th.stack([n * errors[key] for key, n in cameras]).sum() / len(decoded.images[0])
         return losses, metrics
 
-    def _head_losses(self, feat: torch.Tensor, batch: Sequences) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    def _head_losses(self, feat: th.Tensor, batch: Sequences) -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
         feat_reward = feat if self.preset.reward_gradient else feat.detach()
         target = symlog(batch.rewards) if self.preset.symlog_rewards else batch.rewards
         prediction = self.reward_head(feat_reward).float().squeeze(-1)
@@ -162,28 +134,28 @@ class WorldModel(nn.Module):
             goes_on = (~batch.is_terminal).to(logits.dtype)
             entropy = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="none")
             losses["continue"] = self.preset.continue_scale * masked_mean(entropy, batch.mask)
-        with torch.no_grad():  # the report's measures of Fig. 10f; without any reward the relative one is 0
+        with th.no_grad():  # the report's measures of Fig. 10f; without any reward the relative one is 0
             rewards = batch.rewards.flatten()
             absolute = masked_mean((self._unsquashed(prediction).flatten() - rewards).abs(), arrived)
             size = masked_mean(rewards.abs(), arrived)
-            relative = torch.where(size > 0.0, absolute / size.clamp(min=1e-12), torch.zeros_like(size))
+            relative = th.where(size > 0.0, absolute / size.clamp(min=1e-12), th.zeros_like(size))
         return losses, {"reward_error": absolute, "relative_reward_error": relative}
 
-    def reward(self, feat: torch.Tensor) -> torch.Tensor:
+    def reward(self, feat: th.Tensor) -> th.Tensor:
         """Predicted reward for arriving in a state, shape ``(*batch,)``."""
         return self._unsquashed(self.reward_head(feat).float().squeeze(-1))
 
-    def _unsquashed(self, prediction: torch.Tensor) -> torch.Tensor:
+    def _unsquashed(self, prediction: th.Tensor) -> th.Tensor:
         """What the reward head says, on the scale of the environment."""
         return symexp(prediction) if self.preset.symlog_rewards else prediction
 
-    def continue_probability(self, feat: torch.Tensor) -> torch.Tensor:
+    def continue_probability(self, feat: th.Tensor) -> th.Tensor:
         """Predicted probability that the episode does not terminate in a state, shape ``(*batch,)``."""
         if self.continue_head is None:
-            return torch.ones_like(feat[..., 0])
-        return torch.sigmoid(self.continue_head(feat).float().squeeze(-1))
+            return th.ones_like(feat[..., 0])
+        return th.sigmoid(self.continue_head(feat).float().squeeze(-1))
 
-    def kl(self, state: LatentState) -> torch.Tensor:
+    def kl(self, state: LatentState) -> th.Tensor:
         """
         KL(posterior || prior) of every state: per step, unbalanced, before free nats. The report's KL-LOSS in u_t.
 
@@ -192,7 +164,7 @@ class WorldModel(nn.Module):
         """
         return self.latent.kl(state.stats, self.rssm.prior(state.deter))
 
-    def open_loop(self, state: LatentState, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+    def open_loop(self, state: LatentState, actions: th.Tensor) -> dict[str, th.Tensor]:
         """
         What the model expects to see if ``actions`` were executed, without looking (modes only, no random numbers).
 
@@ -204,5 +176,5 @@ class WorldModel(nn.Module):
         for action in actions:
             state = self.rssm.imagine_step(state, action, deterministic=True)
             feats.append(state.feat)
-        feat = torch.stack(feats)
+        feat = th.stack(feats)
         return self.spec.split(self.decoder(feat.flatten(0, 1)), feat.shape[:2])

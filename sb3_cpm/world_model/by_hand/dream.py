@@ -17,7 +17,7 @@ the memory h, the sample z, the action a, and g_x for the gradient of x::
 
 from typing import Any, NamedTuple
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
@@ -42,14 +42,14 @@ class Dynamics(NamedTuple):
     """
 
     latent: GaussianLatent
-    inputs: torch.Tensor
-    inputs_bias: torch.Tensor
-    gates: torch.Tensor
-    norm: torch.Tensor
-    norm_bias: torch.Tensor
+    inputs: th.Tensor
+    inputs_bias: th.Tensor
+    gates: th.Tensor
+    norm: th.Tensor
+    norm_bias: th.Tensor
     norm_eps: float
     update_bias: float
-    prior: tuple[tuple[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+    prior: tuple[tuple[th.Tensor, th.Tensor], tuple[th.Tensor, th.Tensor]]
 
 
 class DreamSettings(NamedTuple):
@@ -62,7 +62,7 @@ class DreamSettings(NamedTuple):
     through_input: bool
 
 
-class Dream(torch.autograd.Function):
+class Dream(th.autograd.Function):
     """
     ``Dream.apply(settings, dynamics, deter, stoch, *actor)``, where ``actor`` has weight and bias of each of the actor's
     layers, and ``deter`` and ``stoch`` are the states to start in, ``n`` of them, without gradient.
@@ -73,8 +73,8 @@ class Dream(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, settings: DreamSettings, dynamics: Dynamics, deter: torch.Tensor, stoch: torch.Tensor, *actor: torch.Tensor
-    ) -> tuple[torch.Tensor, ...]:
+        ctx: Any, settings: DreamSettings, dynamics: Dynamics, deter: th.Tensor, stoch: th.Tensor, *actor: th.Tensor
+    ) -> tuple[th.Tensor, ...]:
         weights, biases = actor[::2], actor[1::2]
         horizon, n, latent = settings.horizon, len(deter), dynamics.latent
         size, hidden, dim = deter.shape[-1], len(dynamics.inputs), len(weights[-1]) // 2
@@ -95,23 +95,23 @@ class Dream(torch.autograd.Function):
         norm_bias = dynamics.norm_bias.clone()
         norm_bias[2 * size :] += dynamics.update_bias
         sampler = OutputSampler(values[-1])
-        kept: list[tuple[torch.Tensor, ...]] = []  # of every step, for the way back
+        kept: list[tuple[th.Tensor, ...]] = []  # of every step, for the way back
         for t in range(horizon):
             seen = seen_rows[t]  # (n, stoch + deter)
             for bias, weight, value in layers[:-1]:
-                seen = F.elu_(torch.addmm(bias, seen, weight, out=value[t]))  # (n, units)
+                seen = F.elu_(th.addmm(bias, seen, weight, out=value[t]))  # (n, units)
             bias, weight, outputs = layers[-1]
-            chance = torch.rand_like(actions[t])
-            action, standard = sampler.sample(torch.addmm(bias, seen, weight, out=outputs[t]), chance)
+            chance = th.rand_like(actions[t])
+            action, standard = sampler.sample(th.addmm(bias, seen, weight, out=outputs[t]), chance)
             actions[t].copy_(action)  # a: (n, action)
-            F.elu_(torch.addmm(dynamics.inputs_bias, to_inner[t], inputs, out=inner[t]))  # x: (n, hidden)
-            products = torch.mm(to_gates[t], gates_weight)  # (n, 3 * deter)
-            gates, mean, spread = torch.native_layer_norm(products, (3 * size,), dynamics.norm, norm_bias, dynamics.norm_eps)
-            opened = torch.sigmoid(gates)  # reset and update; what becomes of the candidate in between is not looked at
+            F.elu_(th.addmm(dynamics.inputs_bias, to_inner[t], inputs, out=inner[t]))  # x: (n, hidden)
+            products = th.mm(to_gates[t], gates_weight)  # (n, 3 * deter)
+            gates, mean, spread = th.native_layer_norm(products, (3 * size,), dynamics.norm, norm_bias, dynamics.norm_eps)
+            opened = th.sigmoid(gates)  # reset and update; what becomes of the candidate in between is not looked at
             bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])  # (n, deter)
-            torch.lerp(deters[t], bounded, opened[:, 2 * size :], out=deters[t + 1])  # h': (n, deter)
-            prior = F.elu_(torch.addmm(prior_bias, deters[t + 1], to_prior))  # p: (n, hidden)
-            stats = torch.addmm(stats_bias, prior, to_stats)  # (n, stats)
+            th.lerp(deters[t], bounded, opened[:, 2 * size :], out=deters[t + 1])  # h': (n, deter)
+            prior = F.elu_(th.addmm(prior_bias, deters[t + 1], to_prior))  # p: (n, hidden)
+            stats = th.addmm(stats_bias, prior, to_stats)  # (n, stats)
             noise = latent.noise(n, like=stats)
             latent.sample(stats, noise, out=stochs[t + 1])  # z': (n, stoch)
             kept.append((chance, standard, products, mean, spread, gates, opened, bounded, prior, stats, noise))
@@ -125,14 +125,14 @@ class Dream(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, of_here: torch.Tensor, of_there: torch.Tensor, of_actions: torch.Tensor, of_outputs: torch.Tensor
-    ) -> tuple[torch.Tensor | None, ...]:
+        ctx: Any, of_here: th.Tensor, of_there: th.Tensor, of_actions: th.Tensor, of_outputs: th.Tensor
+    ) -> tuple[th.Tensor | None, ...]:
         settings, dynamics, dim = ctx.settings, ctx.dynamics, ctx.dim
         rows, here, *rest = ctx.saved_tensors
         values, weights = rest[: len(rest) // 2], rest[len(rest) // 2 :]
         latent, horizon = dynamics.latent, settings.horizon
         hidden, size = len(dynamics.inputs), here.shape[-1] - latent.size
-        chance, standard, *_ = stacked = [torch.stack(part) for part in zip(*ctx.kept, strict=True)]  # (H, n, ...) each
+        chance, standard, *_ = stacked = [th.stack(part) for part in zip(*ctx.kept, strict=True)]  # (H, n, ...) each
         gates, opened, bounded, prior, stats, noise = stacked[5:]
         products, mean, spread = (part.unbind(0) for part in stacked[2:5])
         before = rows[:-1, :, dim + latent.size : dim + latent.size + size]  # h: (H, n, deter)
@@ -148,7 +148,7 @@ class Dream(torch.autograd.Function):
         outside = of_there.clone()  # row i is state i + 1's
         outside[:-1] += of_here[1:]
         from_outside, from_outputs, from_actions = outside.unbind(0), of_outputs.unbind(0), of_actions.unbind(0)
-        to_values = [torch.empty_like(one) for one in values]
+        to_values = [th.empty_like(one) for one in values]
         *to_hidden, to_outputs = (one.unbind(0) for one in to_values)
         back = list(zip(reversed(weights[1:]), reversed(to_hidden), reversed(elu_values), strict=True))
         (to_prior, _), (to_stats, _) = dynamics.prior
@@ -157,25 +157,25 @@ class Dream(torch.autograd.Function):
         for t in reversed(range(horizon)):  # g_stoch and g_deter are those of state t + 1
             g_stats = latent.pull_back(slopes_of_stats[t], g_stoch)  # (n, stats)
             g_prior = (g_stats @ to_stats).mul_(elu_prior[t])  # (n, hidden)
-            g_deter = torch.addmm(g_deter, g_prior, to_prior)  # (n, deter)
+            g_deter = th.addmm(g_deter, g_prior, to_prior)  # (n, deter)
             g_gates = (slopes_of_gates[t] * g_deter.unsqueeze(1)).flatten(1)  # (n, 3, deter) -> (n, 3 * deter)
             g_products = norm_backward(g_gates, products[t], mean[t], spread[t], *norm)[0]
             g_memory, g_inner = (g_products @ dynamics.gates).split((size, hidden), dim=-1)  # of h and x
             g_action, g_sampled = ((g_inner * elu_inner[t]) @ dynamics.inputs).split((dim, latent.size), dim=-1)  # of a and z
             g_action = g_action + from_actions[t]  # (n, action); its two outputs, mean and spread, both get it
-            gradient = torch.addcmul(
-                from_outputs[t], torch.cat((g_action, g_action), dim=-1), slopes_of_outputs[t], out=to_outputs[t]
+            gradient = th.addcmul(
+                from_outputs[t], th.cat((g_action, g_action), dim=-1), slopes_of_outputs[t], out=to_outputs[t]
             )
             for weight, to_layer, elu in back:
-                gradient = torch.mm(gradient, weight, out=to_layer[t]).mul_(elu[t])  # (n, units)
+                gradient = th.mm(gradient, weight, out=to_layer[t]).mul_(elu[t])  # (n, units)
             if t > 0:  # the state to start in has no gradient
                 g_state = from_outside[t - 1]  # state t's, (n, stoch + deter)
                 if settings.through_input:
-                    g_state = torch.addmm(g_state, gradient, weights[0])
+                    g_state = th.addmm(g_state, gradient, weights[0])
                 g_stoch, g_remembered = g_state.split((latent.size, size), dim=-1)
                 g_stoch = g_stoch + g_sampled
                 g_deter = g_memory.addcmul_(g_deter, remembered[t]).add_(g_remembered)
-        found: list[torch.Tensor] = []
+        found: list[th.Tensor] = []
         for to_value, inputs in zip(to_values, [here, *values[:-1]], strict=True):
             found += [rows_weight_gradient(to_value, inputs), to_value.sum((0, 1))]
         return None, None, None, None, *found

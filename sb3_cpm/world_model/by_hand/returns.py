@@ -7,7 +7,7 @@ error to its weights. Autograd takes longer to find and follow it than the produ
 
 from typing import Any, NamedTuple
 
-import torch
+import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
@@ -25,12 +25,12 @@ class Pass(NamedTuple):
     :param inputs: of each layer, shape ``(rows, size_in)``
     """
 
-    output: torch.Tensor
+    output: th.Tensor
     layers: list[nn.Linear]
-    inputs: list[torch.Tensor]
+    inputs: list[th.Tensor]
 
-    @torch.no_grad()
-    def to_inputs(self, gradient: torch.Tensor) -> torch.Tensor:
+    @th.no_grad()
+    def to_inputs(self, gradient: th.Tensor) -> th.Tensor:
         """
         :param gradient: of the output, shape ``(rows, output_dim)``
         :return: that of the first layer's inputs
@@ -39,13 +39,13 @@ class Pass(NamedTuple):
             gradient = elu_gradient_(linear(gradient, layer.weight.t()), values)
         return linear(gradient, self.layers[0].weight.t())
 
-    @torch.no_grad()
-    def to_parameters(self, gradient: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    @th.no_grad()
+    def to_parameters(self, gradient: th.Tensor) -> tuple[th.Tensor, ...]:
         """
         :param gradient: of the output, shape ``(rows, output_dim)``
         :return: of each layer's weight and bias
         """
-        found: list[torch.Tensor] = []
+        found: list[th.Tensor] = []
         for layer, values in zip(reversed(self.layers), reversed(self.inputs), strict=True):
             found = [weight_gradient(gradient, values), gradient.sum(0), *found]
             if layer is not self.layers[0]:
@@ -53,8 +53,8 @@ class Pass(NamedTuple):
         return tuple(found)
 
 
-@torch.no_grad()
-def through(mlp: MLP, inputs: torch.Tensor) -> Pass:
+@th.no_grad()
+def through(mlp: MLP, inputs: th.Tensor) -> Pass:
     """
     :param mlp: any, its output layer linear
     :param inputs: shape ``(*batch, input_dim)``
@@ -66,7 +66,7 @@ def through(mlp: MLP, inputs: torch.Tensor) -> Pass:
     return Pass(linear(values[-1], layers[-1].weight, layers[-1].bias), layers, values)
 
 
-class Returns(torch.autograd.Function):
+class Returns(th.autograd.Function):
     """
     ``Returns.apply(rewards, feats, critic, continue_head, gamma, lambda_)``: the lambda-returns of
     :func:`~sb3_cpm.world_model.losses.lambda_returns` for values and continuation of the states that are arrived in,
@@ -79,24 +79,24 @@ class Returns(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        rewards: torch.Tensor,
-        feats: torch.Tensor,
+        rewards: th.Tensor,
+        feats: th.Tensor,
         critic: MLP,
         continue_head: MLP | None,
         gamma: float,
         lambda_: float,
-    ) -> tuple[torch.Tensor, ...]:
+    ) -> tuple[th.Tensor, ...]:
         valued = through(critic, feats)  # of H * n rows
         values = valued.output.view_as(rewards)  # (H, n): values[i] is that of state i + 1, in which action i arrives
         ends = None if continue_head is None else through(continue_head, feats)
-        goes_on = torch.ones_like(rewards) if ends is None else ends.output.view_as(rewards).sigmoid()
+        goes_on = th.ones_like(rewards) if ends is None else ends.output.view_as(rewards).sigmoid()
         discounts = gamma * goes_on
-        returns = torch.empty_like(rewards)
-        inputs = torch.addcmul(rewards, discounts, values, value=1.0 - lambda_).unbind(0)
+        returns = th.empty_like(rewards)
+        inputs = th.addcmul(rewards, discounts, values, value=1.0 - lambda_).unbind(0)
         decays = (lambda_ * discounts).unbind(0)
         following = values[-1]  # (n,): after the last step the critic has the word
         for i in reversed(range(len(rewards))):
-            following = torch.addcmul(inputs[i], decays[i], following, out=returns[i])
+            following = th.addcmul(inputs[i], decays[i], following, out=returns[i])
         ctx.mark_non_differentiable(values, discounts)
         if any(ctx.needs_input_grad):
             ctx.passes, ctx.lambda_, ctx.decays = (valued, ends), lambda_, decays
@@ -105,7 +105,7 @@ class Returns(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, gradient: th.Tensor, *_: th.Tensor) -> tuple[th.Tensor | None, ...]:
         values, discounts, goes_on, returns = ctx.saved_tensors
         valued, ends = ctx.passes
         to_rewards = gradient.clone()  # of return i, also by all that come before it
@@ -116,7 +116,7 @@ class Returns(torch.autograd.Function):
         to_values[-1].addcmul_(rows[-1], ctx.decays[-1])
         to_feats = valued.to_inputs(to_values.view(-1, 1))
         if ends is not None:
-            following = torch.cat((returns[1:], values[-1:]))  # (H, n): the return after each step
-            to_logits = to_rewards * torch.lerp(values, following, ctx.lambda_) * discounts * (1.0 - goes_on)
+            following = th.cat((returns[1:], values[-1:]))  # (H, n): the return after each step
+            to_logits = to_rewards * th.lerp(values, following, ctx.lambda_) * discounts * (1.0 - goes_on)
             to_feats += ends.to_inputs(to_logits.view(-1, 1))
         return to_rewards, to_feats.view(*values.shape, -1), None, None, None, None

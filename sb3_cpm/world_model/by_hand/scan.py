@@ -15,7 +15,7 @@ sample z and g_x for the gradient of x::
 
 from typing import Any, NamedTuple
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
@@ -26,13 +26,13 @@ from sb3_cpm.world_model.fast.activation import tanh_
 class Weights(NamedTuple):
     """Of all layers, as ``torch.nn.Linear`` and ``LayerNorm`` hold them. Sizes are those of what is read and given."""
 
-    stoch: torch.Tensor  # (hidden, stoch)
-    gates: torch.Tensor  # (3 * deter, hidden + deter): reset, candidate and update, of a and h
-    norm: torch.Tensor  # (3 * deter,)
-    norm_bias: torch.Tensor  # (3 * deter,)
-    deter: torch.Tensor  # (hidden, deter)
-    out: torch.Tensor  # (stats, hidden)
-    out_bias: torch.Tensor  # (stats,)
+    stoch: th.Tensor  # (hidden, stoch)
+    gates: th.Tensor  # (3 * deter, hidden + deter): reset, candidate and update, of a and h
+    norm: th.Tensor  # (3 * deter,)
+    norm_bias: th.Tensor  # (3 * deter,)
+    deter: th.Tensor  # (hidden, deter)
+    out: th.Tensor  # (stats, hidden)
+    out_bias: th.Tensor  # (stats,)
 
 
 class ScanSettings(NamedTuple):
@@ -49,7 +49,7 @@ class ScanSettings(NamedTuple):
     norm_eps: float
 
 
-class Scan(torch.autograd.Function):
+class Scan(th.autograd.Function):
     """
     ``Scan.apply(settings, noise, is_first, deter, stoch, actions_in, embed_in, *weights)``.
 
@@ -62,20 +62,20 @@ class Scan(torch.autograd.Function):
     def forward(
         ctx: Any,
         settings: ScanSettings,
-        noise: torch.Tensor,
-        is_first: torch.Tensor,
-        deter: torch.Tensor,
-        stoch: torch.Tensor,
-        actions_in: torch.Tensor,
-        embed_in: torch.Tensor,
-        *weights: torch.Tensor,
-    ) -> tuple[torch.Tensor, ...]:
+        noise: th.Tensor,
+        is_first: th.Tensor,
+        deter: th.Tensor,
+        stoch: th.Tensor,
+        actions_in: th.Tensor,
+        embed_in: th.Tensor,
+        *weights: th.Tensor,
+    ) -> tuple[th.Tensor, ...]:
         layers, latent = Weights(*weights), settings.latent
         hidden, size = actions_in.shape[-1], deter.shape[-1]
         resets, first = rows_with_resets(is_first), is_first.unbind(0)
         inputs = actions_in.new_empty(*actions_in.shape[:2], hidden + size)  # (L, n, hidden + deter): a and h, side by side
         inner, memory = (part.unbind(0) for part in inputs.split((hidden, size), dim=-1))  # L views: (n, hidden), (n, deter)
-        posteriors = torch.empty_like(embed_in)  # (L, n, hidden)
+        posteriors = th.empty_like(embed_in)  # (L, n, hidden)
         # taking a row of a tensor, or a transpose, costs as much as a small operation: each is taken once
         rows = [part.unbind(0) for part in (actions_in, embed_in, inputs, posteriors, noise)]
         from_stoch, to_gates, from_deter, to_stats = (
@@ -83,33 +83,31 @@ class Scan(torch.autograd.Function):
         )
         norm_bias = layers.norm_bias.clone()
         norm_bias[2 * size :] += settings.update_bias
-        kept: list[tuple[torch.Tensor, ...]] = []
+        kept: list[tuple[th.Tensor, ...]] = []
         for t, (action_in, embedding, both, posterior, chance) in enumerate(zip(*rows, strict=True)):
             if resets[t]:
                 deter, stoch = deter.masked_fill(first[t], 0.0), stoch.masked_fill(first[t], 0.0)
             before = stoch  # (n, stoch)
-            F.elu_(torch.addmm(action_in, stoch, from_stoch, out=inner[t]))  # a: (n, hidden)
+            F.elu_(th.addmm(action_in, stoch, from_stoch, out=inner[t]))  # a: (n, hidden)
             memory[t].copy_(deter)  # h: (n, deter)
             products = both @ to_gates  # (n, 3 * deter)
-            gates, mean, spread = torch.native_layer_norm(products, (3 * size,), layers.norm, norm_bias, settings.norm_eps)
+            gates, mean, spread = th.native_layer_norm(products, (3 * size,), layers.norm, norm_bias, settings.norm_eps)
             # (n, 3 * deter): reset and update; what becomes of the candidate in between is not looked at
-            opened = torch.sigmoid(gates)
+            opened = th.sigmoid(gates)
             bounded = tanh_(opened[:, :size] * gates[:, size : 2 * size])  # (n, deter)
-            deter = torch.lerp(deter, bounded, opened[:, 2 * size :])  # h': (n, deter)
-            F.elu_(torch.addmm(embedding, deter, from_deter, out=posterior))  # p: (n, hidden)
-            stats = torch.addmm(layers.out_bias, posterior, to_stats)  # (n, stats)
+            deter = th.lerp(deter, bounded, opened[:, 2 * size :])  # h': (n, deter)
+            F.elu_(th.addmm(embedding, deter, from_deter, out=posterior))  # p: (n, hidden)
+            stats = th.addmm(layers.out_bias, posterior, to_stats)  # (n, stats)
             stoch = latent.sample(stats, chance)  # (n, stoch)
             kept.append((deter, stoch, stats, before, products, mean, spread, gates, opened, bounded))
-        deters, stochs, all_stats, *rest = (torch.stack(part) for part in zip(*kept, strict=True))  # (L, n, ...) each
+        deters, stochs, all_stats, *rest = (th.stack(part) for part in zip(*kept, strict=True))  # (L, n, ...) each
         ctx.settings, ctx.resets = settings, resets
         ctx.save_for_backward(noise, is_first, deters, all_stats, inputs, posteriors, *rest, *weights)
         return deters, stochs, all_stats
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, of_deters: torch.Tensor, of_stochs: torch.Tensor, of_stats: torch.Tensor
-    ) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, of_deters: th.Tensor, of_stochs: th.Tensor, of_stats: th.Tensor) -> tuple[th.Tensor | None, ...]:
         noise, is_first, deters, all_stats, inputs, posteriors, *rest = ctx.saved_tensors
         befores, products, mean, spread, gates, opened, bounded, *weights = rest
         layers, latent = Weights(*weights), ctx.settings.latent
@@ -122,7 +120,7 @@ class Scan(torch.autograd.Function):
         slopes_of_stats = latent.slopes(all_stats, noise)
         norm = (layers.norm, layers.norm_bias)
         g_all_stats, g_all_posteriors, g_all_gates, g_all_products, g_all_a = found = [
-            torch.empty_like(like) for like in (all_stats, posteriors, products, products, elu_a)
+            th.empty_like(like) for like in (all_stats, posteriors, products, products, elu_a)
         ]
         rows = [
             part.unbind(0)
@@ -132,19 +130,19 @@ class Scan(torch.autograd.Function):
         first, elus, keeps = is_first.unbind(0), elu_a.unbind(0), remembered.unbind(0)
 
         # of h' and z, as far as the steps after t made them: (n, deter), (n, stoch)
-        g_deter, g_stoch = torch.zeros_like(deters[0]), torch.zeros_like(of_stochs[0])
+        g_deter, g_stoch = th.zeros_like(deters[0]), th.zeros_like(of_stochs[0])
         for t, (of_deter, of_stoch, of_stat, slope, elu, slope_of_gates, product, average, deviation) in reversed(
             list(enumerate(zip(*rows, strict=True)))
         ):
-            g_stats = torch.add(of_stat, latent.pull_back(slope, of_stoch + g_stoch), out=to_stats[t])  # (n, stats)
-            g_posterior = torch.mm(g_stats, layers.out, out=to_posteriors[t]).mul_(elu)  # (n, hidden)
-            g_deter = torch.addmm(of_deter + g_deter, g_posterior, layers.deter)  # (n, deter)
+            g_stats = th.add(of_stat, latent.pull_back(slope, of_stoch + g_stoch), out=to_stats[t])  # (n, stats)
+            g_posterior = th.mm(g_stats, layers.out, out=to_posteriors[t]).mul_(elu)  # (n, hidden)
+            g_deter = th.addmm(of_deter + g_deter, g_posterior, layers.deter)  # (n, deter)
             # (n, 3, deter) * (n, 1, deter)
-            torch.mul(slope_of_gates, g_deter.unsqueeze(1), out=to_gates[t].unflatten(-1, (3, size)))
+            th.mul(slope_of_gates, g_deter.unsqueeze(1), out=to_gates[t].unflatten(-1, (3, size)))
             g_products = norm_backward(to_gates[t], product, average, deviation, *norm, (True, False, False))[0]
             to_products[t].copy_(g_products)  # (n, 3 * deter)
             g_inner, g_memory = (g_products @ layers.gates).split((hidden, size), dim=-1)  # (n, hidden), (n, deter)
-            g_a = torch.mul(g_inner, elus[t], out=to_a[t])  # (n, hidden)
+            g_a = th.mul(g_inner, elus[t], out=to_a[t])  # (n, hidden)
             g_deter = g_memory.addcmul_(g_deter, keeps[t])  # of h, which is step t - 1's h': (n, deter)
             g_stoch = g_a @ layers.stoch  # (n, stoch)
             if ctx.resets[t]:
@@ -163,7 +161,7 @@ class Scan(torch.autograd.Function):
         return None, None, None, None, None, g_all_a, g_all_posteriors, *gradients
 
 
-def rows_with_resets(is_first: torch.Tensor) -> list[bool]:
+def rows_with_resets(is_first: th.Tensor) -> list[bool]:
     """
     Rows in which any column begins an episode; on a GPU all of them, where looking takes longer than resetting nothing.
 
@@ -173,8 +171,8 @@ def rows_with_resets(is_first: torch.Tensor) -> list[bool]:
 
 
 def gate_slopes(
-    reset: torch.Tensor, candidate: torch.Tensor, bounded: torch.Tensor, update: torch.Tensor, before: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+    reset: th.Tensor, candidate: th.Tensor, bounded: th.Tensor, update: th.Tensor, before: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
     """
     Slopes of a GRU's new memory with respect to its gates (after the layer norm) and to its old memory, of all steps.
 
@@ -187,24 +185,24 @@ def gate_slopes(
     """
     inner = update * (1.0 - bounded.square())
     slopes = (inner * candidate * reset * (1.0 - reset), inner * reset, (bounded - before) * update * (1.0 - update))
-    return torch.stack(slopes, dim=-2), 1.0 - update
+    return th.stack(slopes, dim=-2), 1.0 - update
 
 
 def norm_backward(
-    gradient: torch.Tensor,
-    inputs: torch.Tensor,
-    mean: torch.Tensor,
-    spread: torch.Tensor,
-    gain: torch.Tensor,
-    bias: torch.Tensor,
+    gradient: th.Tensor,
+    inputs: th.Tensor,
+    mean: th.Tensor,
+    spread: th.Tensor,
+    gain: th.Tensor,
+    bias: th.Tensor,
     wanted: tuple[bool, bool, bool],
-) -> tuple[torch.Tensor, ...]:
+) -> tuple[th.Tensor, ...]:
     """Gradients of a layer norm's input, gain and bias."""
     shape = inputs.shape[-1:]
-    return torch.ops.aten.native_layer_norm_backward(gradient, inputs, shape, mean, spread, gain, bias, list(wanted))
+    return th.ops.aten.native_layer_norm_backward(gradient, inputs, shape, mean, spread, gain, bias, list(wanted))
 
 
-def rows_weight_gradient(gradients: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+def rows_weight_gradient(gradients: th.Tensor, inputs: th.Tensor) -> th.Tensor:
     """
     Gradient of a layer's weight, over all steps and columns.
 

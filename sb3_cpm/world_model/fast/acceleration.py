@@ -16,30 +16,30 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import torch
+import torch as th
 from torch import nn
 
 
-def mixed_precision(device: torch.device, enabled: bool) -> AbstractContextManager:
+def mixed_precision(device: th.device, enabled: bool) -> AbstractContextManager:
     """
     Context in which matrix products and convolutions run in bfloat16. Leave it before weights change: it keeps their casts.
 
     :param device: where they run
     :param enabled: False for a context that does nothing
     """
-    return torch.autocast(device.type, dtype=torch.bfloat16) if enabled else contextlib.nullcontext()
+    return th.autocast(device.type, dtype=th.bfloat16) if enabled else contextlib.nullcontext()
 
 
-def is_plain(tensor: torch.Tensor) -> bool:
+def is_plain(tensor: th.Tensor) -> bool:
     """
     Whether a tensor lies on a CPU in float32, and neither mixed precision nor ``torch.compile`` is at work: what is computed
     by hand for speed is made for that.
     """
     return (
         tensor.device.type == "cpu"
-        and tensor.dtype == torch.float32
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
+        and tensor.dtype == th.float32
+        and not th.is_autocast_enabled("cpu")
+        and not th.compiler.is_compiling()
     )
 
 
@@ -57,7 +57,7 @@ def processor() -> str:
         return platform.processor()
 
 
-def cache_slices(*tensors: torch.Tensor, rows: int = 64) -> Iterator[tuple[torch.Tensor, ...]]:
+def cache_slices(*tensors: th.Tensor, rows: int = 64) -> Iterator[tuple[th.Tensor, ...]]:
     """
     The same rows of all tensors, on a CPU so few that several operations on them stay in its caches; on a GPU all at once.
 
@@ -68,18 +68,18 @@ def cache_slices(*tensors: torch.Tensor, rows: int = 64) -> Iterator[tuple[torch
     return zip(*(one.split(size) for one in tensors), strict=True)
 
 
-def check_mixed_precision(device: torch.device) -> None:
+def check_mixed_precision(device: th.device) -> None:
     """
     :raises ValueError: if the device cannot compute in bfloat16
     """
-    if device.type == "cuda" and not torch.cuda.is_bf16_supported():
+    if device.type == "cuda" and not th.cuda.is_bf16_supported():
         raise ValueError(
-            f"amp=True needs bfloat16, which {torch.cuda.get_device_name(device)} does not have (Ampere and later do). "
+            f"amp=True needs bfloat16, which {th.cuda.get_device_name(device)} does not have (Ampere and later do). "
             "Leave `amp` off."
         )
 
 
-def compile_modules(modules: Iterable[nn.Module], device: torch.device) -> bool:
+def compile_modules(modules: Iterable[nn.Module], device: th.device) -> bool:
     """
     Compile modules in place: their weights keep their names, and what calls them does not change. The first call of each
     then takes seconds to minutes. Where nothing can be compiled they stay as they are, with a warning that says why.
@@ -111,8 +111,8 @@ def is_compiled(module: nn.Module) -> bool:
 def why_not_compile(device_type: str) -> str:
     """:return: the error of compiling something small on such a device, empty if that works; tried once per process"""
     try:
-        probe = torch.compile(lambda x: torch.tanh(x) * 2.0 + 1.0)
-        probe(torch.zeros(8, device=device_type))
+        probe = th.compile(lambda x: th.tanh(x) * 2.0 + 1.0)
+        probe(th.zeros(8, device=device_type))
     except Exception as error:  # dynamo and inductor wrap whatever fails, from a missing g++ to an unsupported Python
         return f"{type(error).__name__}: {str(error).strip().splitlines()[0][:200] if str(error).strip() else 'no message'}"
     return ""

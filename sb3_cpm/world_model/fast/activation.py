@@ -8,7 +8,7 @@ Measured on Intel's processors; on AMD's, where ``exp`` is MKL's too and may be 
 
 from typing import Any
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
@@ -21,11 +21,11 @@ SLICE = 2**16  # numbers that several operations find in the cache; with fewer i
 class ELU(nn.Module):
     """``torch.nn.ELU(inplace=True)``, faster where :func:`elu_` is."""
 
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
         return elu_(inputs)
 
 
-def elu_(values: torch.Tensor) -> torch.Tensor:
+def elu_(values: th.Tensor) -> th.Tensor:
     """
     ELU (Clevert et al. 2016, alpha 1) in place, differentiable once.
 
@@ -37,16 +37,16 @@ def elu_(values: torch.Tensor) -> torch.Tensor:
     return _ELU.apply(values)
 
 
-def elu_gradient_(gradient: torch.Tensor, result: torch.Tensor) -> torch.Tensor:
+def elu_gradient_(gradient: th.Tensor, result: th.Tensor) -> th.Tensor:
     """
     :param gradient: of ELU's result; overwritten
     :param result: of ELU
     :return: that of what went in, the same tensor
     """
-    return torch.ops.aten.elu_backward.grad_input(gradient, 1.0, 1.0, 1.0, True, result, grad_input=gradient)
+    return th.ops.aten.elu_backward.grad_input(gradient, 1.0, 1.0, 1.0, True, result, grad_input=gradient)
 
 
-def tanh_(values: torch.Tensor) -> torch.Tensor:
+def tanh_(values: th.Tensor) -> th.Tensor:
     """
     tanh in place, without gradient: by a sigmoid on AMD's processors, where MKL's takes five times as long.
 
@@ -58,30 +58,30 @@ def tanh_(values: torch.Tensor) -> torch.Tensor:
     return values.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
 
 
-def is_faster(values: torch.Tensor) -> bool:
+def is_faster(values: th.Tensor) -> bool:
     """Whether values are many, lie in memory without gaps, and are plain, on a processor where it has been measured."""
     return (
         values.numel() >= SLICE
-        and (values.is_contiguous() or values.is_contiguous(memory_format=torch.channels_last))
+        and (values.is_contiguous() or values.is_contiguous(memory_format=th.channels_last))
         and is_plain(values)
         and not is_amd()
     )
 
 
-class _ELU(torch.autograd.Function):
+class _ELU(th.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, values: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, values: th.Tensor) -> th.Tensor:
         in_memory = values if values.is_contiguous() else values.permute(0, 2, 3, 1)
         exponential = values.new_empty(SLICE)
         for part in in_memory.view(-1).split(SLICE):
-            below = torch.exp(part, out=exponential[: len(part)]).clamp_(max=1.0).sub_(1.0)
-            torch.maximum(part, below, out=part)
+            below = th.exp(part, out=exponential[: len(part)]).clamp_(max=1.0).sub_(1.0)
+            th.maximum(part, below, out=part)
         ctx.mark_dirty(values)
         ctx.save_for_backward(values)
         return values
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
         (result,) = ctx.saved_tensors
-        return torch.ops.aten.elu_backward(gradient, 1.0, 1.0, 1.0, True, result)
+        return th.ops.aten.elu_backward(gradient, 1.0, 1.0, 1.0, True, result)

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import torch
+import torch as th
 
 WARM_UP = 2  # calls before a function is recorded
 MOST_GRAPHS = 4  # of a function, one for every shape of its inputs: each takes memory
 
-Signature = tuple[tuple[torch.Size, torch.dtype] | None, ...]
+Signature = tuple[tuple[th.Size, th.dtype] | None, ...]
 
 
 class Recording(NamedTuple):
@@ -28,8 +28,8 @@ class Recording(NamedTuple):
     :param outputs: what the function returned while it was recorded; replaying writes to its tensors
     """
 
-    graph: torch.cuda.CUDAGraph
-    inputs: tuple[torch.Tensor | None, ...]
+    graph: th.cuda.CUDAGraph
+    inputs: tuple[th.Tensor | None, ...]
     outputs: Any
 
 
@@ -40,22 +40,22 @@ class GraphPool:
     :param device: of all their tensors
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: th.device) -> None:
         self.device = device
-        self.handle = torch.cuda.graph_pool_handle()
+        self.handle = th.cuda.graph_pool_handle()
 
 
 @contextmanager
 def forbidden_synchronization() -> Iterator[None]:
     """Context in which looking at a number on a GPU is an error."""
-    before = torch.cuda.get_sync_debug_mode()
+    before = th.cuda.get_sync_debug_mode()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it is said to be a prototype
-            torch.cuda.set_sync_debug_mode("error")
+            th.cuda.set_sync_debug_mode("error")
         yield
     finally:
-        torch.cuda.set_sync_debug_mode(before)
+        th.cuda.set_sync_debug_mode(before)
 
 
 @contextmanager
@@ -90,7 +90,7 @@ class Graphed:
         self.recordings: dict[Signature, Recording] = {}
         self.works = True
 
-    def __call__(self, *inputs: torch.Tensor | None) -> Any:
+    def __call__(self, *inputs: th.Tensor | None) -> Any:
         signature = tuple(None if one is None else (one.shape, one.dtype) for one in inputs)
         if signature not in self.recordings:
             self.calls[signature] += 1
@@ -101,11 +101,11 @@ class Graphed:
         for fixed, new in zip(recording.inputs, inputs, strict=True):
             if fixed is not None and new is not None:
                 fixed.copy_(new)
-        with torch.cuda.device(self.pool.device):
+        with th.cuda.device(self.pool.device):
             recording.graph.replay()
         return recording.outputs
 
-    def _without(self, inputs: tuple[torch.Tensor | None, ...]) -> Any:
+    def _without(self, inputs: tuple[th.Tensor | None, ...]) -> Any:
         """As it is, on the look-out for what a graph cannot do: found out while recording, it would break the generator."""
         if not self.works:
             return self.function(*inputs)
@@ -124,12 +124,12 @@ class Graphed:
         )
         return self.function(*inputs)
 
-    def _record(self, inputs: tuple[torch.Tensor | None, ...]) -> Recording:
+    def _record(self, inputs: tuple[th.Tensor | None, ...]) -> Recording:
         fixed = tuple(None if one is None else one.clone() for one in inputs)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.device(self.pool.device):
-            stream = torch.cuda.Stream()  # torch's own stream for recording belongs to the GPU that was the first to use it
-            with no_garbage_collection(), torch.cuda.graph(graph, pool=self.pool.handle, stream=stream):
+        graph = th.cuda.CUDAGraph()
+        with th.cuda.device(self.pool.device):
+            stream = th.cuda.Stream()  # torch's own stream for recording belongs to the GPU that was the first to use it
+            with no_garbage_collection(), th.cuda.graph(graph, pool=self.pool.handle, stream=stream):
                 outputs = self.function(*fixed)
         return Recording(graph, fixed, outputs)
 
@@ -141,11 +141,11 @@ class GraphedFunctions:
     :param device: of all their tensors
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: th.device) -> None:
         self.pool = GraphPool(device)
         self.functions: dict[str, Graphed] = {}
 
-    def run(self, name: str, function: Callable[..., Any], *inputs: torch.Tensor | None) -> Any:
+    def run(self, name: str, function: Callable[..., Any], *inputs: th.Tensor | None) -> Any:
         """
         :param name: of the function, also in the warning of one that cannot be recorded
         :param function: see :class:`Graphed`; of a name only the first is ever called

@@ -13,7 +13,7 @@ small matrices), everything is PyTorch's own.
 import functools
 from typing import Any
 
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch import nn
 from torch.autograd.function import once_differentiable
@@ -26,11 +26,11 @@ MIN_ROWS, MIN_MULTIPLICATIONS = 64, 2**22  # below, calling costs more than mult
 class Linear(nn.Linear):
     """``torch.nn.Linear``, faster where :func:`linear` is."""
 
-    def forward(self, input: torch.Tensor) -> torch.Tensor:
+    def forward(self, input: th.Tensor) -> th.Tensor:
         return linear(input, self.weight, self.bias)
 
 
-def linear(inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+def linear(inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
     """
     ``inputs @ weight.T + bias``, differentiable once.
 
@@ -45,12 +45,12 @@ def linear(inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None
     return flat.view(*inputs.shape[:-1], len(weight))
 
 
-def is_faster(inputs: torch.Tensor, size_out: int) -> bool:
+def is_faster(inputs: th.Tensor, size_out: int) -> bool:
     """Whether the product of such inputs with a matrix of ``size_out`` rows should be oneDNN's."""
     return is_large(inputs, size_out) and prefers_onednn()
 
 
-def is_large(inputs: torch.Tensor, size_out: int) -> bool:
+def is_large(inputs: th.Tensor, size_out: int) -> bool:
     """Whether the product of such inputs with a matrix of ``size_out`` rows keeps a CPU busy, in plain float32."""
     return (
         inputs.numel() >= MIN_ROWS * inputs.shape[-1] and inputs.numel() * size_out >= MIN_MULTIPLICATIONS and is_plain(inputs)
@@ -66,16 +66,16 @@ def prefers_onednn() -> bool:
 @functools.cache
 def onednn_works() -> bool:
     """Whether the operator is there and right, with and without transposed matrices; tried once per process."""
-    left, right, bias = torch.arange(35.0).view(5, 7).cos(), torch.arange(21.0).view(3, 7).sin(), torch.ones(3)
+    left, right, bias = th.arange(35.0).view(5, 7).cos(), th.arange(21.0).view(3, 7).sin(), th.ones(3)
     try:
         pairs = [(left, right), (left.t().contiguous().t(), right), (left, right.t().contiguous().t())]
         found = [_multiply(one, other, bias) for one, other in pairs]
     except (AttributeError, RuntimeError, TypeError):  # built without oneDNN, for another processor, another signature
         return False
-    return all(torch.allclose(one, F.linear(left, right, bias), atol=1e-4) for one in found)
+    return all(th.allclose(one, F.linear(left, right, bias), atol=1e-4) for one in found)
 
 
-def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+def affine(inputs: th.Tensor, matrix: th.Tensor, bias: th.Tensor) -> th.Tensor:
     """
     ``inputs @ matrix + bias`` of large matrices on a CPU, by the faster of both; no gradients.
 
@@ -83,17 +83,17 @@ def affine(inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> to
     :param matrix: shape ``(size_in, size_out)``
     :param bias: shape ``(size_out,)``
     """
-    return _multiply(inputs, matrix.t(), bias) if prefers_onednn() else torch.addmm(bias, inputs, matrix)
+    return _multiply(inputs, matrix.t(), bias) if prefers_onednn() else th.addmm(bias, inputs, matrix)
 
 
-def multiply(left: torch.Tensor, right: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
+def multiply(left: th.Tensor, right: th.Tensor, out: th.Tensor | None = None) -> th.Tensor:
     """``left @ right.T`` of large matrices on a CPU, by the faster of both, into ``out`` where given; no gradients."""
     if not prefers_onednn():
-        return torch.mm(left, right.t(), out=out)
+        return th.mm(left, right.t(), out=out)
     return _multiply(left, right) if out is None else out.copy_(_multiply(left, right))
 
 
-def weight_gradient(gradient: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+def weight_gradient(gradient: th.Tensor, inputs: th.Tensor) -> th.Tensor:
     """
     Gradient of a layer's weight; no gradients of its own.
 
@@ -104,7 +104,7 @@ def weight_gradient(gradient: torch.Tensor, inputs: torch.Tensor) -> torch.Tenso
     return _multiply(gradient.t(), inputs.t()) if is_faster(inputs, gradient.shape[-1]) else gradient.t() @ inputs
 
 
-def add_product_(total: torch.Tensor, left: torch.Tensor, right: torch.Tensor) -> None:
+def add_product_(total: th.Tensor, left: th.Tensor, right: th.Tensor) -> None:
     """Add ``left @ right.T`` to ``total``; as :func:`multiply`."""
     if prefers_onednn():
         total.add_(_multiply(left, right))
@@ -112,22 +112,22 @@ def add_product_(total: torch.Tensor, left: torch.Tensor, right: torch.Tensor) -
         total.addmm_(left, right.t())
 
 
-def _multiply(left: torch.Tensor, right: torch.Tensor, bias: torch.Tensor | None = None) -> torch.Tensor:
+def _multiply(left: th.Tensor, right: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
     """``left @ right.T + bias`` for any strides without overlap."""
-    return torch.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")
+    return th.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")
 
 
-class _Product(torch.autograd.Function):
+class _Product(th.autograd.Function):
     """:func:`linear` of matrices."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+    def forward(ctx: Any, inputs: th.Tensor, weight: th.Tensor, bias: th.Tensor | None) -> th.Tensor:
         ctx.save_for_backward(inputs, weight)
         return _multiply(inputs, weight, bias)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         inputs, weight = ctx.saved_tensors
         gradient = gradient.contiguous()  # the gradient of a sum has no strides
         to_inputs = to_weight = to_bias = None

@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
+import torch as th
 import torch.nn.functional as F
 from torch.autograd.function import once_differentiable
 
@@ -44,31 +44,31 @@ class Choice:
     :param size: of all one-hot vectors together
     """
 
-    def __init__(self, columns: torch.Tensor, size: int) -> None:
+    def __init__(self, columns: th.Tensor, size: int) -> None:
         self.columns, self.size = columns, size
 
     def __getitem__(self, rows: slice) -> "Choice":
         return Choice(self.columns[rows], self.size)
 
-    def add_up(self, matrix: torch.Tensor) -> torch.Tensor:
+    def add_up(self, matrix: th.Tensor) -> th.Tensor:
         """
         :param matrix: shape ``(size, size_out)``
         :return: the one-hot vectors' product with it, shape ``(n, size_out)``
         """
         parts = matrix.split(WIDTH, dim=1)
-        return torch.cat([F.embedding_bag(self.columns, part.contiguous(), mode="sum") for part in parts], dim=1)
+        return th.cat([F.embedding_bag(self.columns, part.contiguous(), mode="sum") for part in parts], dim=1)
 
     @cached_property
-    def rows(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def rows(self) -> tuple[th.Tensor, th.Tensor]:
         """For one position after the other the rows that have a one there, and where each position's begin."""
         groups = self.columns.shape[1]
         classes = self.columns % (self.size // groups)
         # NumPy sorts small integers by their digits, ten times faster than by comparing them
         order = np.argsort(classes.t().numpy().astype(np.uint16), axis=1, kind="stable")
-        counts = torch.bincount(self.columns.flatten(), minlength=self.size)
-        return torch.from_numpy(order.ravel()), counts.cumsum(0) - counts
+        counts = th.bincount(self.columns.flatten(), minlength=self.size)
+        return th.from_numpy(order.ravel()), counts.cumsum(0) - counts
 
-    def affine(self, inputs: torch.Tensor, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    def affine(self, inputs: th.Tensor, matrix: th.Tensor, bias: th.Tensor) -> th.Tensor:
         """
         ``inputs @ matrix + bias``, without gradients.
 
@@ -76,10 +76,10 @@ class Choice:
         :param matrix: shape ``(size_in, size_out)``
         :param bias: shape ``(size_out,)``
         """
-        rest = torch.addmm(bias, inputs[:, self.size :], matrix[self.size :])
+        rest = th.addmm(bias, inputs[:, self.size :], matrix[self.size :])
         return rest.add_(self.add_up(matrix[: self.size]))
 
-    def write_gradient(self, inputs: torch.Tensor, gradient: torch.Tensor, to_matrix: torch.Tensor) -> None:
+    def write_gradient(self, inputs: th.Tensor, gradient: th.Tensor, to_matrix: th.Tensor) -> None:
         """
         :param inputs: of :meth:`affine`
         :param gradient: of its result
@@ -91,7 +91,7 @@ class Choice:
         to_matrix[self.size :] = inputs[:, self.size :].t() @ gradient
 
 
-def find_choice(inputs: torch.Tensor, one_hot: OneHot | None, size_out: int) -> Choice | None:
+def find_choice(inputs: th.Tensor, one_hot: OneHot | None, size_out: int) -> Choice | None:
     """
     What was chosen, or None where looking does not pay (few rows, small matrices, everything but float32 on a CPU), or where
     the inputs are no samples but probabilities.
@@ -104,12 +104,12 @@ def find_choice(inputs: torch.Tensor, one_hot: OneHot | None, size_out: int) -> 
         return None
     inputs = inputs.detach()
     blocks = inputs[:, : one_hot.size].unflatten(1, one_hot)
-    classes = (blocks @ torch.arange(float(one_hot.classes))).long().clamp_(0, one_hot.classes - 1)
-    columns = classes + one_hot.classes * torch.arange(one_hot.groups)
+    classes = (blocks @ th.arange(float(one_hot.classes))).long().clamp_(0, one_hot.classes - 1)
+    columns = classes + one_hot.classes * th.arange(one_hot.groups)
     return Choice(columns, one_hot.size) if bool((inputs.gather(1, columns) == 1.0).all()) else None
 
 
-def one_hot_affine(inputs: torch.Tensor, choice: Choice, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+def one_hot_affine(inputs: th.Tensor, choice: Choice, matrix: th.Tensor, bias: th.Tensor) -> th.Tensor:
     """
     ``inputs @ matrix + bias``, differentiable once.
 
@@ -134,23 +134,23 @@ class OneHotLinear(Linear):
         super().__init__(size_in, size_out)
         self.one_hot = one_hot
 
-    def forward(self, input: torch.Tensor) -> torch.Tensor:
+    def forward(self, input: th.Tensor) -> th.Tensor:
         choice = find_choice(input, self.one_hot, len(self.weight))
         return super().forward(input) if choice is None else one_hot_affine(input, choice, self.weight.t(), self.bias)
 
 
-class _Product(torch.autograd.Function):
+class _Product(th.autograd.Function):
     """:func:`one_hot_affine`; the matrix may lie in memory either way, and its gradient lies as it does."""
 
     @staticmethod
-    def forward(ctx: Any, inputs: torch.Tensor, choice: Choice, matrix: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, inputs: th.Tensor, choice: Choice, matrix: th.Tensor, bias: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(inputs, matrix)
         ctx.choice = choice
         return choice.affine(inputs, matrix, bias)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         inputs, matrix = ctx.saved_tensors
         choice: Choice = ctx.choice
         gradient = gradient.contiguous()  # the gradient of a sum has no strides
@@ -158,7 +158,7 @@ class _Product(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             to_inputs = multiply(gradient, matrix)
         if ctx.needs_input_grad[2]:
-            to_matrix = torch.empty_like(matrix)  # with its strides
+            to_matrix = th.empty_like(matrix)  # with its strides
             choice.write_gradient(inputs, gradient, to_matrix)
         if ctx.needs_input_grad[3]:
             to_bias = gradient.sum(0)

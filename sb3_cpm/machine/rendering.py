@@ -4,7 +4,7 @@ when an environment is made.
 
 SAPIEN draws with Vulkan. Whether that works cannot be asked politely: without a driver SAPIEN raises, with an odd driver the
 process dies. So :func:`probe_renderer` tries it in a child process, :func:`setup_rendering` installs software Vulkan where the
-probe fails (:mod:`sb3_cpm.envs.vulkan_install`), and :func:`ensure_renderer` is the fast part, which every environment goes
+probe fails (:mod:`sb3_cpm.machine.vulkan_install`), and :func:`ensure_renderer` is the fast part, which every environment goes
 through.
 """
 
@@ -26,9 +26,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_cpm.envs import vulkan, vulkan_install
-from sb3_cpm.envs.companions import companions
 from sb3_cpm.extras import check_installed
+from sb3_cpm.machine import vulkan, vulkan_install
+from sb3_cpm.machine.thread_affinity import renderer_threads
 
 SOFTWARE = ("llvmpipe", "swiftshader")
 """Parts of the device names of renderers that run on the CPU."""
@@ -96,7 +96,8 @@ def ensure_renderer() -> Renderer:
 @contextlib.contextmanager
 def opened(renderer: Renderer) -> Iterator[None]:
     """
-    Build scenes within this context: their renderer's thread is known then, and stays near (:mod:`sb3_cpm.envs.companions`).
+    Build scenes within this context: their renderer's thread is known then, and stays near
+    (:mod:`sb3_cpm.machine.thread_affinity`).
 
     :param renderer: this process's
     """
@@ -106,7 +107,7 @@ def opened(renderer: Renderer) -> Iterator[None]:
         return
     import sapien
 
-    with companions():
+    with renderer_threads():
         system = sapien.render.RenderSystem(sapien.Device("cpu"))
     yield  # all of a process's scenes share one Vulkan device, which lives as long as one of them does
     del system
@@ -251,7 +252,7 @@ def probe_renderer(use_private: bool = True, timeout: float = 180.0) -> Probe:
     :param timeout: seconds until a hanging child is given up
     """
     start = time.perf_counter()
-    code = f"from sb3_cpm.envs.rendering import _probe; _probe({use_private!r})"
+    code = f"from sb3_cpm.machine.rendering import _probe; _probe({use_private!r})"
     # not the whole sys.path: a library that failed to import may have left its own folder there
     package = str(Path(__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))}

@@ -15,8 +15,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_cpm.envs.batch import ManiSkillBatch
-from sb3_cpm.envs.vec_env import ManiSkillVecEnv
+from sb3_cpm.envs.maniskill.batch import ManiSkillBatch
+from sb3_cpm.envs.maniskill.vec_env import ManiSkillVecEnv
 
 Tree = dict[str, np.ndarray]
 

@@ -3,7 +3,7 @@ A mesh for people turned into one for a software renderer: the same shape and co
 
 The original is read by SAPIEN itself, so any file that can be drawn can be made light (glTF, Collada, STL, OBJ, with textures
 or without), and what comes out is what SAPIEN would have drawn, only coarser. It is made once and kept in the cache folder
-(:func:`sb3_cpm.envs.vulkan.cache_folder`).
+(:func:`sb3_cpm.machine.vulkan.cache_folder`).
 """
 
 import contextlib
@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_cpm.envs import vulkan
 from sb3_cpm.files import NotWrittenError, replacing
+from sb3_cpm.machine import vulkan
 
 FORMAT = 1
 """Part of the cache's key: raise it when the result changes."""

@@ -3,9 +3,9 @@ Light visuals: what a software renderer can draw fast.
 
 On a CPU, ManiSkill's pictures are slow because of triangles, not pixels: the Panda's hand camera alone has 425,160 of
 them, its links 135,000, the floor 20,000. Light visuals draw coarser meshes of the same colours
-(:mod:`sb3_cpm.envs.meshes`), of the robot as of everything else that comes from a file, and a floor of two triangles.
-Collision shapes, masses, joints and the floor's collision plane are untouched, so the physics stay the same to the last
-bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
+(:mod:`sb3_cpm.envs.maniskill.meshes`), of the robot as of everything else that comes from a file, and a floor of two
+triangles. Collision shapes, masses, joints and the floor's collision plane are untouched, so the physics stay the same to the
+last bit. The pictures look alike but are not equal: train and evaluate with the same visuals.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_cpm.envs.meshes import light_shapes
+from sb3_cpm.envs.maniskill.meshes import light_shapes
 
 VISUALS = ("auto", "light", "full")
 

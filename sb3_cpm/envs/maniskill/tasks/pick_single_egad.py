@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import sapien
-import torch
+import torch as th
 from mani_skill import ASSET_DIR
 from mani_skill.agents.robots import Panda, PandaWristCam
 from mani_skill.envs.sapien_env import BaseEnv
@@ -25,7 +25,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.pose import Pose
 
-from sb3_cpm.envs.tasks.lift_cube import GRASP_ANGLE
+from sb3_cpm.envs.maniskill.tasks.lift_cube import GRASP_ANGLE
 
 FOLDER = "mani_skill2_egad"
 MODELS = "info_pick_train_v0.json"
@@ -150,29 +150,29 @@ class PickSingleEGADEnv(BaseEnv):
         lowest = [mesh.bounds[0, 2] for mesh in meshes]
         self.object_zs = -common.to_tensor(lowest, device=self.device).float()
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        with torch.device(self.device):
+    def _initialize_episode(self, env_idx: th.Tensor, options: dict) -> None:
+        with th.device(self.device):
             n = len(env_idx)
             self.table_scene.initialize(env_idx)
-            place = torch.zeros((n, 3))
-            place[:, :2] = (2 * torch.rand((n, 2)) - 1) * self.object_region
+            place = th.zeros((n, 3))
+            place[:, :2] = (2 * th.rand((n, 2)) - 1) * self.object_region
             place[:, 2] = self.object_zs[env_idx]
             pose = Pose.create_from_pq(p=place, q=random_quaternions(n, lock_x=True, lock_y=True))
             self.obj.set_pose(pose)
             center = (pose * self.obj.cmass_local_pose[env_idx]).p
             self.goal_site.set_pose(Pose.create_from_pq(self._draw_goals(center)))
 
-    def _draw_goals(self, center: torch.Tensor) -> torch.Tensor:
+    def _draw_goals(self, center: th.Tensor) -> th.Tensor:
         """Goals that are not where the object is already: drawn again until they are far enough, at most 100 times."""
-        region = torch.tensor(self.goal_region)
-        goal = torch.zeros_like(center)
-        near = torch.ones(len(center), dtype=torch.bool)
+        region = th.tensor(self.goal_region)
+        goal = th.zeros_like(center)
+        near = th.ones(len(center), dtype=th.bool)
         for _ in range(100):
-            drawn = torch.rand_like(center) * region
+            drawn = th.rand_like(center) * region
             drawn[:, :2] = 2 * drawn[:, :2] - region[:2]
             drawn[:, 2] = (drawn[:, 2] + center[:, 2]).clamp(max=self.goal_region[2])
-            goal = torch.where(near[:, None], drawn, goal)
-            near = torch.linalg.norm(goal - center, dim=1) <= 2 * self.goal_thresh
+            goal = th.where(near[:, None], drawn, goal)
+            near = th.linalg.norm(goal - center, dim=1) <= 2 * self.goal_thresh
             if not near.any():
                 break
         return goal
@@ -183,9 +183,9 @@ class PickSingleEGADEnv(BaseEnv):
         """Of the centre of mass: EGAD's origins lie anywhere."""
         return self.obj.pose * self.obj.cmass_local_pose
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> dict[str, th.Tensor]:
         to_goal = self.goal_site.pose.p - self.obj_pose.p
-        placed = torch.linalg.norm(to_goal, dim=1) <= self.goal_thresh
+        placed = th.linalg.norm(to_goal, dim=1) <= self.goal_thresh
         static = self.agent.is_static(0.2)
         return {
             "obj_to_goal_pos": to_goal,
@@ -195,7 +195,7 @@ class PickSingleEGADEnv(BaseEnv):
             "success": placed & static,
         }
 
-    def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
+    def _get_obs_extra(self, info: dict) -> dict[str, th.Tensor]:
         hand, goal = self.agent.tcp.pose, self.goal_site.pose.p
         obs = {"tcp_pose": hand.raw_pose, "goal_pos": goal, "is_grasped": info["is_grasped"]}
         if "state" in self.obs_mode:
@@ -206,12 +206,12 @@ class PickSingleEGADEnv(BaseEnv):
             obs["obj_to_goal_pos"] = goal - obj.p
         return obs
 
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        distance = torch.linalg.norm(self.obj_pose.p - self.agent.tcp.pose.p, dim=1)
-        to_goal = torch.linalg.norm(info["obj_to_goal_pos"], dim=1)
-        reward = 1 - torch.tanh(3 * (distance - self.obj_size).clamp(min=0.0))
-        reward = reward + info["is_grasped"] * (3 + 3 * (1 - torch.tanh(3 * to_goal)))
-        return torch.where(info["success"], 10.0, reward)
+    def compute_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
+        distance = th.linalg.norm(self.obj_pose.p - self.agent.tcp.pose.p, dim=1)
+        to_goal = th.linalg.norm(info["obj_to_goal_pos"], dim=1)
+        reward = 1 - th.tanh(3 * (distance - self.obj_size).clamp(min=0.0))
+        reward = reward + info["is_grasped"] * (3 + 3 * (1 - th.tanh(3 * to_goal)))
+        return th.where(info["success"], 10.0, reward)
 
-    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+    def compute_normalized_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
         return self.compute_dense_reward(obs, action, info) / 10

@@ -23,9 +23,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_cpm.envs.batch import ManiSkillBatch
-from sb3_cpm.envs.maniskill import build_batch, make_maniskill_env, spec_of
-from sb3_cpm.envs.start_states import StartState, check_state
+from sb3_cpm.envs.maniskill.batch import ManiSkillBatch
+from sb3_cpm.envs.maniskill.env import build_batch, make_maniskill_env, spec_of
+from sb3_cpm.envs.maniskill.start_states import StartState, check_state
 
 
 class ManiSkillVecEnv(VecEnv):
@@ -33,7 +33,7 @@ class ManiSkillVecEnv(VecEnv):
     Use :func:`make_maniskill_vec_env` to get one. No ``Monitor`` and no ``VecMonitor`` is needed.
 
     Seeds: ``seed(s)`` gives environment ``i`` the seed ``s + i`` at the next ``reset()``, and all its later episodes follow
-    from that. Start states as for :class:`~sb3_cpm.envs.maniskill.ManiSkillEnv`.
+    from that. Start states as for :class:`~sb3_cpm.envs.maniskill.env.ManiSkillEnv`.
 
     :param batch: a simulation of any number of environments
     """

@@ -3,7 +3,7 @@ A scripted controller that solves PickCube-v1 every time, as a source of demonst
 
 ::
 
-    python -m sb3_cpm.envs.scripted demos/pickcube --episodes 20
+    python -m sb3_cpm.envs.maniskill.scripted demos/pickcube --episodes 20
 
 writes ``demos/pickcube/*.h5`` and ``.json`` as ManiSkill's own tools do, for
 :meth:`CPMBuffer.add_demonstrations <sb3_cpm.buffers.CPMBuffer.add_demonstrations>`.
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_cpm.envs.maniskill_checks import choose_renderer
+from sb3_cpm.envs.maniskill.checks import choose_renderer
 
 #: Metres of motion that an action of 1 asks for (pd_ee_delta_pose and pd_ee_delta_pos)
 REACH = 0.1

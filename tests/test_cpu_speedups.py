@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("mani_skill")
 
-from sb3_cpm.envs import batch, make_maniskill_env, meshes, thrift
-from sb3_cpm.envs.scripted import PickCubeController
+from sb3_cpm.envs import make_maniskill_env
+from sb3_cpm.envs.maniskill import batch, cpu_speedups, meshes
+from sb3_cpm.envs.maniskill.scripted import PickCubeController
 
 pytestmark = pytest.mark.maniskill
 
@@ -63,7 +64,7 @@ def test_episodes_are_equal_to_the_last_bit(monkeypatch: pytest.MonkeyPatch, con
         for thing in (env.unwrapped.cube, env.unwrapped.agent.tcp):
             assert thing._poses_at_once
             thing.pose = thing.pose  # can still be set
-    monkeypatch.setattr(batch, "save_work", lambda env: None)
+    monkeypatch.setattr(batch, "speed_up", lambda env: None)
     with env_of(lambda: make_maniskill_env("PickCube-v1", obs_mode="state", control_mode=control_mode)) as env:
         plain = episodes(env)
     assert_equal(saved, plain)
@@ -82,7 +83,7 @@ def test_pictures_are_equal_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> 
             return [*shown, env.render(), env.step(np.ones(7))[0]]
 
     saved = pictures()
-    monkeypatch.setattr(batch, "save_work", lambda env: None)
+    monkeypatch.setattr(batch, "speed_up", lambda env: None)
     assert_equal(saved, pictures())
     assert not np.array_equal(saved[1], saved[3])
 
@@ -123,4 +124,4 @@ def test_a_simulation_on_the_gpu_stays_as_it_is() -> None:
     class Env:
         scene = Scene()  # nothing else is looked at
 
-    thrift.save_work(Env())
+    cpu_speedups.speed_up(Env())

@@ -11,8 +11,9 @@ import platform
 import shutil
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
+
+from sb3_cpm.machine.memory import memory_gib
 
 PYTHONS = ((3, 10), (3, 12))
 """Oldest and newest Python that the package is tested with."""
@@ -66,14 +67,14 @@ def examine() -> Iterator[Finding]:
     """:return: the findings, one by one, since the last ones take some seconds"""
     yield _python()
     yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
-    torch = _torch()
-    yield torch
+    th = _torch()
+    yield th
     yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
     yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
     yield _memory()
     yield _disk()
     yield _video()
-    yield from _rendering(torch.well)
+    yield from _rendering(th.well)
 
 
 def _python() -> Finding:
@@ -92,39 +93,20 @@ def _package(name: str, cure: str) -> Finding:
 
 def _torch() -> Finding:
     try:
-        import torch
+        import torch as th
     except (ImportError, OSError) as error:  # OSError: a CUDA library that is not there
         return Finding("torch", False, str(error).splitlines()[0], "install torch, see https://pytorch.org")
-    if torch.cuda.is_available():
-        device = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    if th.cuda.is_available():
+        device = ", ".join(th.cuda.get_device_name(i) for i in range(th.cuda.device_count()))
     else:
-        device = f"no GPU, {torch.get_num_threads()} CPU threads of {os.cpu_count()} cores"
-    return Finding("torch", True, f"{torch.__version__}, {device}")
+        device = f"no GPU, {th.get_num_threads()} CPU threads of {os.cpu_count()} cores"
+    return Finding("torch", True, f"{th.__version__}, {device}")
 
 
 def _memory() -> Finding:
-    free, total = _memory_gib()
+    free, total = memory_gib()
     found = f"{free:.1f} of {total:.1f} GiB free"
     return Finding("memory", free >= MEMORY, found, f"a training run needs about {MEMORY:g} GiB: close other programs")
-
-
-def _memory_gib(group: Path = Path("/sys/fs/cgroup")) -> tuple[float, float]:
-    """Free and total, of the machine or, if that is less, of the container."""
-    page = os.sysconf("SC_PAGE_SIZE")
-    total, free = os.sysconf("SC_PHYS_PAGES") * page, os.sysconf("SC_AVPHYS_PAGES") * page
-    meminfo = Path("/proc/meminfo")
-    if meminfo.exists():  # "available" counts what the system would give back, "free" does not
-        fields = dict(line.split(":") for line in meminfo.read_text().splitlines() if ":" in line)
-        free = int(fields.get("MemAvailable", str(free // 1024)).split()[0]) * 1024
-    limit, used = (group / name for name in ("memory.max", "memory.current"))
-    if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
-        allowed = int(limit.read_text())
-        details = group / "memory.stat"
-        fields = dict(line.split() for line in details.read_text().splitlines()) if details.exists() else {}
-        # files that nobody has touched for a while count as used, and are given back as soon as memory is wanted
-        held = int(used.read_text()) - int(fields.get("inactive_file", "0"))
-        total, free = min(total, allowed), min(free, allowed - held)
-    return free / 2**30, total / 2**30
 
 
 def _disk() -> Finding:
@@ -151,7 +133,7 @@ def _rendering(torch_works: bool) -> Iterator[Finding]:
     if not all(_package(name, "").well for name in ("mani_skill", "sapien")):
         yield Finding("SAPIEN renders", False, "not tried without ManiSkill", "pip install 'sb3_cpm[maniskill]'")
         return
-    from sb3_cpm.envs import rendering, vulkan
+    from sb3_cpm.machine import rendering, vulkan
 
     try:
         vulkan.cache_folder()

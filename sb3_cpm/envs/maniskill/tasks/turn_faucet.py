@@ -9,7 +9,7 @@ stay as the last episode left it), and the start of one episode leaves the other
 from typing import Any
 
 import numpy as np
-import torch
+import torch as th
 import trimesh
 from mani_skill.envs.tasks.tabletop.turn_faucet import TurnFaucetEnv
 from mani_skill.envs.utils import randomization
@@ -45,13 +45,13 @@ class TurnFaucetDenseEnv(TurnFaucetEnv):
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
-        self.target_link_pos = torch.zeros((self.num_envs, 3), device=self.device)
+        self.target_link_pos = th.zeros((self.num_envs, 3), device=self.device)
         self._angle_before = self.current_angle.clone()
         links = [self.agent.robot.links_map[name] for name in FINGERS[self.robot_uids]]
         self._finger_points = [self._surface([link] * self.num_envs) for link in links]
         self._handle_points = self._surface(self._target_switch_links)
 
-    def _surface(self, links: list[Link]) -> torch.Tensor:
+    def _surface(self, links: list[Link]) -> th.Tensor:
         """
         :param links: one per environment
         :return: points on their collision shapes, in their own frames, shape ``(n_envs, SURFACE_POINTS, 3)``
@@ -62,22 +62,22 @@ class TurnFaucetDenseEnv(TurnFaucetEnv):
             # the same points for the same shape, whatever the seed of the episode
             sampled[id(link)] = np.asarray(trimesh.sample.sample_surface(mesh, SURFACE_POINTS, seed=0)[0])
         points = np.stack([sampled[id(link)] for link in links])
-        return torch.as_tensor(points, dtype=torch.float32, device=self.device)
+        return th.as_tensor(points, dtype=th.float32, device=self.device)
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        with torch.device(self.device):
+    def _initialize_episode(self, env_idx: th.Tensor, options: dict) -> None:
+        with th.device(self.device):
             self.scene_builder.initialize(env_idx)
             # the handle at its start, the other joints at zero
-            rows, joint = torch.arange(len(env_idx)), self.target_switch_link.joint
-            angles = torch.zeros_like(self.faucet.get_qpos()[env_idx])
+            rows, joint = th.arange(len(env_idx)), self.target_switch_link.joint
+            angles = th.zeros_like(self.faucet.get_qpos()[env_idx])
             angles[rows, joint.active_index.to(self.device)[env_idx]] = self.init_angle[env_idx]
             self.faucet.set_qpos(angles)
-            self.faucet.set_qvel(torch.zeros_like(angles))
+            self.faucet.set_qvel(th.zeros_like(angles))
             # ManiSkill's draws in ManiSkill's order
-            place = torch.zeros((len(env_idx), 3))
+            place = th.zeros((len(env_idx), 3))
             place[:, :2] = randomization.uniform(-0.05, 0.05, size=(len(env_idx), 2))
             place[:, 2] = self.model_offsets[env_idx, 2]
-            bounds = (-torch.pi / 12, torch.pi / 12)
+            bounds = (-th.pi / 12, th.pi / 12)
             turn = randomization.random_quaternions(n=len(env_idx), lock_x=True, lock_y=True, bounds=bounds)
             self.faucet.set_pose(Pose.create_from_pq(place, turn))
             if self.gpu_sim_enabled:
@@ -87,7 +87,7 @@ class TurnFaucetDenseEnv(TurnFaucetEnv):
                 self.scene._gpu_fetch_all()
             self._remember_handle(env_idx)
 
-    def _remember_handle(self, env_idx: torch.Tensor) -> None:
+    def _remember_handle(self, env_idx: th.Tensor) -> None:
         """Where the handle is at the start, which the observation shows during the whole episode."""
         link = self.target_switch_link
         position = (link.pose * link.cmass_local_pose).p
@@ -99,25 +99,25 @@ class TurnFaucetDenseEnv(TurnFaucetEnv):
         super()._before_control_step()
         self._angle_before = self.current_angle.clone()
 
-    def finger_distance(self) -> torch.Tensor:
+    def finger_distance(self) -> th.Tensor:
         """:return: metres between the nearer finger and the handle, shape ``(n_envs,)``"""
         handle = _placed(self._handle_points, self.target_switch_link.pose)
         links = [self.agent.robot.links_map[name] for name in FINGERS[self.robot_uids]]
         fingers = [_placed(points, link.pose) for points, link in zip(self._finger_points, links, strict=True)]
-        return torch.cdist(handle, torch.cat(fingers, dim=1)).amin(dim=(1, 2))
+        return th.cdist(handle, th.cat(fingers, dim=1)).amin(dim=(1, 2))
 
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+    def compute_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
         left = self.target_angle - self.current_angle
         turned = self.current_angle - self._angle_before
-        reward = 1 - torch.tanh(5 * self.finger_distance())
-        reward = reward + 3 * (1 - torch.tanh(2 * left.clamp(min=0.0))) + 5 * torch.tanh(2 * turned)
-        return torch.where(info["success"], 10.0, reward)
+        reward = 1 - th.tanh(5 * self.finger_distance())
+        reward = reward + 3 * (1 - th.tanh(2 * left.clamp(min=0.0))) + 5 * th.tanh(2 * turned)
+        return th.where(info["success"], 10.0, reward)
 
-    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+    def compute_normalized_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
         return self.compute_dense_reward(obs, action, info) / 10
 
 
-def _placed(points: torch.Tensor, pose: Pose) -> torch.Tensor:
+def _placed(points: th.Tensor, pose: Pose) -> th.Tensor:
     """Points of a link's frame in the world's frame."""
     matrix = pose.to_transformation_matrix()
     return points @ matrix[:, :3, :3].transpose(1, 2) + matrix[:, None, :3, 3]

@@ -1,5 +1,5 @@
 """
-Installing software Vulkan (Mesa's lavapipe) with apt: as anybody into a private folder that :mod:`sb3_cpm.envs.vulkan` then
+Installing software Vulkan (Mesa's lavapipe) with apt: as anybody into a private folder that :mod:`sb3_cpm.machine.vulkan` then
 uses, or, if root asks for it, for the whole machine.
 
 SAPIEN needs Mesa 24.3 or newer. Debian 12 has that in its backports suite only; Debian 13 and an updated Ubuntu 24.04 have it
@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_cpm.envs.vulkan import cache_folder, private_folder
+from sb3_cpm.machine.vulkan import cache_folder, private_folder
 
 MINIMUM_MESA = (24, 3)
 """The first Mesa whose lavapipe SAPIEN accepts."""

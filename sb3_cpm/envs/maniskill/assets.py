@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_cpm.envs.tasks import REPORT_TASKS, register_tasks
+from sb3_cpm.envs.maniskill.tasks import REPORT_TASKS, register_report_tasks
 
 GROUPS = {"OpenCabinetDoor-v1": ("partnet_mobility_cabinet",)}
 """What ManiSkill forgot to note that a task needs."""
@@ -157,7 +157,7 @@ def _remove(path: Path) -> None:
 
 # ---------------------------------------------------------------------- which
 def _known(env_ids: Sequence[str]) -> Sequence[str]:
-    register_tasks()
+    register_report_tasks()
     from mani_skill.utils.registration import REGISTERED_ENVS
 
     for env_id in env_ids:
@@ -219,7 +219,7 @@ def _examine_ycb(folder: Path) -> list[str]:
 
 
 def _examine_egad(folder: Path) -> list[str]:
-    from sb3_cpm.envs.tasks.pick_single_egad import MODELS, model_files
+    from sb3_cpm.envs.maniskill.tasks.pick_single_egad import MODELS, model_files
 
     return _examine_models(folder / MODELS, lambda model_id: list(model_files(folder, model_id)))
 

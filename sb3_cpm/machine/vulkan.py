@@ -1,6 +1,7 @@
 """
 Using software Vulkan (Mesa's lavapipe) that lies in a private folder, from within a running Python process, and asking Vulkan
-for its drivers. How it gets there is told in :mod:`sb3_cpm.envs.vulkan_install`, who uses it in :mod:`sb3_cpm.envs.rendering`.
+for its drivers. How it gets there is told in :mod:`sb3_cpm.machine.vulkan_install`, who uses it in
+:mod:`sb3_cpm.machine.rendering`.
 """
 
 import ctypes

@@ -15,14 +15,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 
-from sb3_cpm.envs.batch import OBS_MODES, ManiSkillBatch
-from sb3_cpm.envs.clouds import CloudSettings
-from sb3_cpm.envs.maniskill_checks import check_sizes, check_task, check_task_kwargs, choose_renderer, explained
-from sb3_cpm.envs.rendering import opened
-from sb3_cpm.envs.simulation import choose_simulation
-from sb3_cpm.envs.start_states import StartState, check_state
-from sb3_cpm.envs.visuals import choose_visuals
+from sb3_cpm.envs.maniskill.batch import OBS_MODES, ManiSkillBatch
+from sb3_cpm.envs.maniskill.checks import check_sizes, check_task, check_task_kwargs, choose_renderer, explained
+from sb3_cpm.envs.maniskill.clouds import CloudSettings
+from sb3_cpm.envs.maniskill.simulation import choose_simulation
+from sb3_cpm.envs.maniskill.start_states import StartState, check_state
+from sb3_cpm.envs.maniskill.visuals import choose_visuals
 from sb3_cpm.extras import needed
+from sb3_cpm.machine.rendering import opened
 
 
 class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -172,7 +172,8 @@ def make_maniskill_env(
     :param goal_points: additional points around the goal
     :param max_distance: metres from the camera beyond which points are dropped
     :param point_sampling: which points stay where there are more than ``n_points``: ``"random"`` (ruled by the episode's seed
-        and the step) or ``"farthest"``: spread as widely as possible, see :func:`~sb3_cpm.envs.clouds.farthest_points`
+        and the step) or ``"farthest"``: spread as widely as possible, see
+        :func:`~sb3_cpm.envs.maniskill.clouds.farthest_points`
     :param point_frame: where the points' zero is: ``"world"``, ``"base"`` of the robot, or ``"end_effector"``
     :param point_labels: a seventh column: 0 for the robot, 1, 2, ... for the other things in the order in which the scene
         lists them, -1 for the points at the goal. Privileged: a camera does not tell this
@@ -246,7 +247,8 @@ def build_batch(
     Check everything, then build. Parameters as for :func:`make_maniskill_env`, and:
 
     :param num_envs: environments in one simulation
-    :param sim_backend: ``"physx_cpu"``, ``"physx_cuda"`` or ``"auto"``, see :func:`~sb3_cpm.envs.simulation.choose_simulation`
+    :param sim_backend: ``"physx_cpu"``, ``"physx_cuda"`` or ``"auto"``, see
+        :func:`~sb3_cpm.envs.maniskill.simulation.choose_simulation`
     """
     height, width = check_sizes(image_size, n_points, goal_points, max_distance, max_episode_steps, render_size)
     cloud = CloudSettings(n_points, goal_points, max_distance, point_sampling, point_frame, point_labels).check()

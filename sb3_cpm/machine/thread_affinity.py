@@ -22,8 +22,8 @@ _core = -1
 
 
 @contextmanager
-def companions() -> Iterator[None]:
-    """Threads that begin within this context, and are there at its end, follow from now on; on Linux."""
+def renderer_threads() -> Iterator[None]:
+    """Threads that begin within this context, and are there at its end, are the renderer's from now on; on Linux."""
     global _threads, _process, _core
     before = _tasks()
     yield
@@ -31,8 +31,8 @@ def companions() -> Iterator[None]:
     _threads, _process, _core = (_threads & now) | (now - before), os.getpid(), -1
 
 
-def follow() -> None:
-    """Bind the companions to the core on which this thread is running. Costs a microsecond where nothing has moved."""
+def follow_simulation() -> None:
+    """Bind the renderer's threads to the core on which this thread is running. Costs a microsecond where nothing has moved."""
     global _core, _threads
     if not _threads:
         return

@@ -9,7 +9,7 @@ Part of that work is done twice or comes to nothing, and is left out here, in th
 * whether the gripper grasps something is worked out from angles between forces, even where there is no force
 * the renderer transforms the triangles of hidden things (the goal marker: a tenth of all) and then draws none of them
 
-States, rewards and pictures are equal to the last bit (``tests/test_thrift.py``). Simulations on a GPU stay as they are.
+States, rewards and pictures are equal to the last bit (``tests/test_cpu_speedups.py``). Simulations on a GPU stay as they are.
 """
 
 import functools
@@ -19,7 +19,7 @@ import numpy as np
 import torch as th
 
 
-def save_work(env: Any) -> None:
+def speed_up(env: Any) -> None:
     """
     Call this after every building of the scene, which makes new robots and things.
 
@@ -29,16 +29,16 @@ def save_work(env: Any) -> None:
         return
     for agent in getattr(env.agent, "agents", [env.agent]):
         if agent is not None:
-            _save_on_grasps(agent)
+            _speed_up_grasps(agent)
             for controller in agent.controllers.values():
-                _save_on_poses(controller)
+                _speed_up_poses(controller)
     links = [link for articulation in env.scene.articulations.values() for link in articulation.links]
     for thing in (*env.scene.actors.values(), *links):
         if len(thing._objs) == 1:
             thing.__class__ = _poses_at_once(type(thing))  # type: ignore[arg-type]
     for thing in env._hidden_objects:
         if hasattr(thing, "hidden"):
-            _save_on_hidden(thing)
+            _speed_up_hidden(thing)
 
 
 # ---------------------------------------------------------------------- where things are
@@ -68,13 +68,13 @@ def _poses_at_once(thing_class: Any) -> Any:
 
 
 # ---------------------------------------------------------------------- where the hand is
-def _save_on_poses(controller: Any) -> None:
+def _speed_up_poses(controller: Any) -> None:
     from mani_skill.agents.controllers.base_controller import CombinedController
     from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 
     if isinstance(controller, CombinedController):
         for part in controller.controllers.values():
-            _save_on_poses(part)
+            _speed_up_poses(part)
     elif isinstance(controller, PDEEPosController):
         controller.__class__ = _asks_once(type(controller))  # type: ignore[arg-type]
 
@@ -111,7 +111,7 @@ def _asks_once(controller_class: Any) -> Any:
 
 
 # ---------------------------------------------------------------------- whether it grasps
-def _save_on_grasps(agent: Any) -> None:
+def _speed_up_grasps(agent: Any) -> None:
     from mani_skill.agents.robots.panda.panda import Panda
 
     if type(agent).is_grasping is Panda.is_grasping:  # not for a robot that defines grasping in a way of its own
@@ -131,7 +131,7 @@ def _is_grasping(agent: Any, object: Any, min_force: float = 0.5, max_angle: flo
 
 
 # ---------------------------------------------------------------------- what is hidden
-def _save_on_hidden(thing: Any) -> None:
+def _speed_up_hidden(thing: Any) -> None:
     """ManiSkill makes hidden things transparent; here they also leave the renderer's list for as long as they are hidden."""
     thing.hide_visual = functools.partial(_hide, thing)
     thing.show_visual = functools.partial(_show, thing)

@@ -9,9 +9,9 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from sb3_cpm.arguments import argument_names, nearest
-from sb3_cpm.envs.assets import missing_assets, require_assets
-from sb3_cpm.envs.rendering import Renderer, ensure_renderer, without_renderer
-from sb3_cpm.envs.tasks import register_tasks, registered_name
+from sb3_cpm.envs.maniskill.assets import missing_assets, require_assets
+from sb3_cpm.envs.maniskill.tasks import register_report_tasks, registered_name
+from sb3_cpm.machine.rendering import Renderer, ensure_renderer, without_renderer
 
 DEFAULT_ROBOT = "panda_wristcam"
 """The Panda with a camera at its hand, the report's robot."""
@@ -20,7 +20,7 @@ NEEDS_PICTURES = ("OpenCabinetDrawer-v1", "OpenCabinetDoor-v1")
 """Tasks that read where something is from the shapes that are drawn, here the handles: they need a renderer in any mode."""
 
 
-class Task(NamedTuple):
+class CheckedTask(NamedTuple):
     """
     A task that can be built.
 
@@ -112,7 +112,9 @@ def choose_renderer(env_id: str, obs_mode: str) -> Renderer:
         return without_renderer()
 
 
-def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: str, max_episode_steps: int | None) -> Task:
+def check_task(
+    env_id: str, robot: str | None, control_mode: str, reward_mode: str, max_episode_steps: int | None
+) -> CheckedTask:
     """
     :param env_id: name of the task
     :param robot: name of the robot or None for :data:`DEFAULT_ROBOT` where possible
@@ -125,7 +127,7 @@ def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: s
     from mani_skill.agents.registration import REGISTERED_AGENTS
     from mani_skill.utils.registration import REGISTERED_ENVS
 
-    register_tasks()
+    register_report_tasks()
     if env_id not in REGISTERED_ENVS:
         raise ValueError(f"Unknown task {env_id!r}. {_nearest(env_id, REGISTERED_ENVS)}")
     spec = REGISTERED_ENVS[registered_name(env_id, reward_mode)]
@@ -138,7 +140,7 @@ def check_task(env_id: str, robot: str | None, control_mode: str, reward_mode: s
     if steps is None:
         raise ValueError(f"{env_id} has no time limit of its own: pass max_episode_steps=...")
     robot = _choose_robot(env_id, spec.cls.SUPPORTED_ROBOTS, robot)
-    task = Task(spec.uid, robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
+    task = CheckedTask(spec.uid, robot or _own_robot(spec.cls), {} if robot is None else {"robot_uids": robot}, steps)
     if task.robot in REGISTERED_AGENTS:
         _check_robot(REGISTERED_AGENTS[task.robot].agent_cls, control_mode)
     require_assets(env_id)

@@ -7,7 +7,7 @@ as the scene (robot, cube, cameras, 50 steps).
 
 from typing import Any
 
-import torch
+import torch as th
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.pose import Pose
@@ -29,7 +29,7 @@ class LiftCubeEnv(PickCubeEnv):
 
     goal_height = 0.2
 
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+    def _initialize_episode(self, env_idx: th.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         # the marker for people: above the cube
         goal = self.cube.pose.p[env_idx].clone()
@@ -42,17 +42,17 @@ class LiftCubeEnv(PickCubeEnv):
             obs.pop(key, None)
         return obs
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> dict[str, th.Tensor]:
         lifted = self.cube.pose.p[:, 2] >= self.goal_height + self.cube_half_size
         static = self.agent.is_static(0.2)
         grasped = self.agent.is_grasping(self.cube, max_angle=GRASP_ANGLE)
         return {"success": lifted & static, "is_obj_placed": lifted, "is_robot_static": static, "is_grasped": grasped}
 
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        distance = torch.linalg.norm(self.cube.pose.p - self.agent.tcp_pose.p, dim=1)
+    def compute_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
+        distance = th.linalg.norm(self.cube.pose.p - self.agent.tcp_pose.p, dim=1)
         height = (self.cube.pose.p[:, 2] - self.cube_half_size) / self.goal_height
-        reward = 1 - torch.tanh(5 * distance) + info["is_grasped"] * (0.25 + height.clamp(max=1.0))
-        return torch.where(info["success"], 2.25, reward)
+        reward = 1 - th.tanh(5 * distance) + info["is_grasped"] * (0.25 + height.clamp(max=1.0))
+        return th.where(info["success"], 2.25, reward)
 
-    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+    def compute_normalized_dense_reward(self, obs: Any, action: th.Tensor, info: dict) -> th.Tensor:
         return self.compute_dense_reward(obs, action, info) / 2.25

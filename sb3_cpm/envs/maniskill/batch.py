@@ -1,8 +1,9 @@
 """
 The layer between ManiSkill's batched tensors and everybody else: N environments of one simulation as NumPy arrays.
 
-:class:`~sb3_cpm.envs.maniskill.ManiSkillEnv` is the case N = 1, :class:`~sb3_cpm.envs.vec_env.ManiSkillVecEnv` any N; both go
-through every line of this module, so what holds for one holds for the other.
+:class:`~sb3_cpm.envs.maniskill.env.ManiSkillEnv` is the case N = 1,
+:class:`~sb3_cpm.envs.maniskill.vec_env.ManiSkillVecEnv` any N; both go through every line of this module, so what holds for
+one holds for the other.
 """
 
 import contextlib
@@ -14,13 +15,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_cpm.envs import clouds
-from sb3_cpm.envs import observations as obs_tools
-from sb3_cpm.envs.companions import follow
-from sb3_cpm.envs.maniskill_checks import explained
-from sb3_cpm.envs.start_states import StartState, restore, state_of
-from sb3_cpm.envs.thrift import save_work
-from sb3_cpm.envs.visuals import Visuals
+from sb3_cpm.envs.maniskill import clouds
+from sb3_cpm.envs.maniskill import observations as obs_tools
+from sb3_cpm.envs.maniskill.checks import explained
+from sb3_cpm.envs.maniskill.cpu_speedups import speed_up
+from sb3_cpm.envs.maniskill.start_states import StartState, restore, state_of
+from sb3_cpm.envs.maniskill.visuals import Visuals
+from sb3_cpm.machine.thread_affinity import follow_simulation
 
 OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
 """Our observation modes and ManiSkill's. "rgb+position+segmentation" costs the same one render as "rgb" alone."""
@@ -76,7 +77,7 @@ class ManiSkillBatch:
         self.episode_seeds = np.zeros(self.num_envs, dtype=np.int64)
         self.state_layout: dict[str, slice] = {}
         self.shows_goal = False
-        self.goal: Any = None  # a goal view wants to know where things are, see `sb3_cpm.envs.goals`
+        self.goal: Any = None  # a goal view wants to know where things are, see `sb3_cpm.envs.maniskill.goals`
         self._visuals = visuals
         self._labels = np.zeros((self.num_envs, 1), dtype=np.int16)
         self.cameras = self._choose_cameras(cameras) if obs_mode == "visual" else ()
@@ -158,7 +159,7 @@ class ManiSkillBatch:
             raise ValueError(f"Expected actions of shape {self.action_space.shape}, got {actions.shape[1:]}.")
         if not np.isfinite(actions).all():
             raise ValueError(f"Actions must be finite numbers within [-1, 1], got {actions}.")
-        follow()
+        follow_simulation()
         raw, reward, terminated, _, info = self.env.step(actions)
         host = obs_tools.to_host({**self._select(raw, info), "reward": reward, "terminated": terminated})
         steps = host["info"]["elapsed_steps"]
@@ -188,7 +189,8 @@ class ManiSkillBatch:
     def get_state(self, i: int) -> StartState:
         """
         :param i: index of the environment
-        :return: everything from which the simulation can go on here or elsewhere, see :mod:`sb3_cpm.envs.start_states`
+        :return: everything from which the simulation can go on here or elsewhere, see
+            :mod:`sb3_cpm.envs.maniskill.start_states`
         """
         grasps = {key: bool(values[i]) for key, values in self._grasps.items()}
         return state_of(self.env, i, self.env_id, int(self.episode_seeds[i]), grasps)
@@ -278,7 +280,7 @@ class ManiSkillBatch:
             self._labels = clouds.label_table(_things(self.env))
         for name in set(self.env._sensors) - set(self.cameras):
             del self.env._sensors[name]
-        save_work(self.env)
+        speed_up(self.env)
 
 
 def _things(env: Any) -> list[dict[int, tuple[str, bool]]]:
