@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_cpm.extras import install_command
+
 PYTHONS = ((3, 10), (3, 12))
 """Oldest and newest Python that the package is tested with."""
 
@@ -65,11 +67,11 @@ def run_doctor() -> int:
 def examine() -> Iterator[Finding]:
     """:return: the findings, one by one, since the last ones take some seconds"""
     yield _python()
-    yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
+    yield from (_package(name, install_command()) for name in REQUIRED)
     torch = _torch()
     yield torch
-    yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
-    yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
+    yield from (_package(name, install_command("run", "contrib")) for name in OPTIONAL)
+    yield from (_package(name, install_command("maniskill")) for name in SIMULATION)
     yield _memory()
     yield _disk()
     yield _video()
@@ -140,7 +142,7 @@ def _video() -> Finding:
 
             path = imageio_ffmpeg.get_ffmpeg_exe()
         except (ImportError, RuntimeError):
-            return Finding("ffmpeg (videos)", False, "not found", "pip install imageio-ffmpeg, or install ffmpeg")
+            return Finding("ffmpeg (videos)", False, "not found", f"{install_command('run')}, or install ffmpeg")
     return Finding("ffmpeg (videos)", True, str(path))
 
 
@@ -149,7 +151,7 @@ def _rendering(torch_works: bool) -> Iterator[Finding]:
         yield Finding("SAPIEN renders", False, "not tried without torch", "see torch")
         return
     if not all(_package(name, "").well for name in ("mani_skill", "sapien")):
-        yield Finding("SAPIEN renders", False, "not tried without ManiSkill", "pip install 'sb3_cpm[maniskill]'")
+        yield Finding("SAPIEN renders", False, "not tried without ManiSkill", install_command("maniskill"))
         return
     from sb3_cpm.envs import rendering, vulkan
 

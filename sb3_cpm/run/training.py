@@ -27,7 +27,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
 from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
-from sb3_cpm.extras import check_installed
+from sb3_cpm.extras import check_installed, needed
 from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
@@ -321,10 +321,9 @@ def _algorithm(name: str) -> type[OffPolicyAlgorithm]:
         return SAC
     if name == "td3":
         return TD3
-    try:
+    with needed("Runs of TQC", "contrib"):
         from sb3_contrib import TQC
-    except ImportError as error:
-        raise ValueError('algorithm="tqc" needs sb3-contrib: pip install "sb3_cpm[contrib]"') from error
+
     return TQC
 
 
