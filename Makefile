@@ -66,7 +66,7 @@ $(VENV)/bin/python:
 	@python="$$(scripts/find_python.sh "$(PYTHON)")" && "$$python" --version && \
 		{ "$$python" -m venv $(VENV) || { rm -f $@; exit 1; }; }
 
-$(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
+$(VENV)/.installed: setup.cfg setup.py constraints.txt | $(VENV)/bin/python
 	@echo "==> Installing sb3_cpm[$(EXTRAS)] with the versions of constraints.txt (about 3 minutes)"
 	@# MuJoCo 4, which constraints.txt once named, leaves files of its parts in the folder of an earlier release
 	@if $(BIN)python -m pip show -q mujoco-core 2>/dev/null; then \

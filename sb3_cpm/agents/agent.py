@@ -111,7 +111,9 @@ class Agent:
             env.close()
             if "action spaces" not in str(error):
                 raise
-            raise ValueError(f"{self.env_id} has the action space {env.action_space}: {error}. Choose another agent.") from error
+            raise ValueError(
+                f"{self.env_id} has the action space {env.action_space}: {error}. Choose another agent."
+            ) from error
         except BaseException:
             env.close()
             raise
