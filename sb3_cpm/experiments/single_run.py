@@ -128,8 +128,7 @@ class Watcher(BaseCallback):
         model.set_logger(Logger(None, [DiagnosticsWriter(self.tables["diagnostics"])]))
         callbacks = [*self.built.callbacks, self]
         if self.found is not None:
-            checkpoints.restore_buffer(self.found, model)
-            callbacks.insert(-1, checkpoints.ChallengerRestorer(self.found, self.built.callbacks))
+            checkpoints.restore(self.found, model, self.built.callbacks)
         try:
             model.learn(
                 spec.steps - model.num_timesteps,

@@ -25,11 +25,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_cpm.arguments import check_arguments
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS
-from sb3_cpm.callbacks import ChallengerCallback, max_episode_steps
+from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.checkpoint import save_model
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import check_installed
 from sb3_cpm.files import NotFiniteError, NotWrittenError, disk_errors_named
+from sb3_cpm.player import max_episode_steps
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run import plots
 from sb3_cpm.run.arguments import misspelt_names_told
