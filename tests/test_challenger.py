@@ -112,7 +112,7 @@ def test_evaluation_has_one_opinion_per_transition(n_steps: int) -> None:
 
 
 def test_evaluation_is_that_of_following_step_by_step() -> None:
-    challenger, batch = small(), random_batch(VECTOR, 2, 6, 1)
+    challenger, batch = small(uncertainty_class="plan2explore"), random_batch(VECTOR, 2, 6, 1)
     batch.is_first[1:] = False
     observations = batch.observations["state"][:, 0]
     evaluation = challenger.evaluate({"state": observations}, batch.actions[1:, 0])
@@ -259,7 +259,7 @@ def test_a_batch_without_any_transition_still_trains_the_rest() -> None:
 
 
 def test_save_and_load(tmp_path: pathlib.Path) -> None:
-    challenger = small(BOTH, uncertainty_kwargs={"target": "stoch"})
+    challenger = small(BOTH, uncertainty_class="plan2explore", uncertainty_kwargs={"target": "stoch"})
     challenger.train(random_batch(BOTH, 2))
     path = tmp_path / "new" / "challenger.pt"
     challenger.save(path)
@@ -268,7 +268,7 @@ def test_save_and_load(tmp_path: pathlib.Path) -> None:
     loaded = Challenger.load(path, "cpu")
     assert loaded.keys == challenger.keys and loaded.preset == challenger.preset and loaded.trained_updates == 1
     assert loaded.action_space == challenger.action_space and loaded.uncertainty.target == "stoch"
-    other = small(BOTH, uncertainty_kwargs={"target": "stoch"})
+    other = small(BOTH, uncertainty_class="plan2explore", uncertainty_kwargs={"target": "stoch"})
     other.load_state(path)
     for key, value in weights(challenger).items():
         assert np.array_equal(value, weights(loaded)[key]) and np.array_equal(value, weights(other)[key]), key

@@ -17,21 +17,22 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("rliable")
 
+from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.__main__ import main
 from sb3_cpm.agents import load_agent
 from sb3_cpm.experiments import EXPERIMENTS, draw, ensure_data, find_data, find_experiment, run_experiment, summary_table
-from sb3_cpm.experiments import single_run as single_run_module
 from sb3_cpm.experiments.catalog import challenger
 from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.figures import COLOURS, DRAWINGS, SCORES, write_title
 from sb3_cpm.experiments.grid import attempt, perform_all
-from sb3_cpm.experiments.single_run import Watcher, perform
+from sb3_cpm.experiments.single_run import perform
 from sb3_cpm.experiments.specification import Contender, Experiment, Plan, RunSpec, Task
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
 from sb3_cpm.files import LockedError, locked
 from sb3_cpm.run.evaluation import evaluate
 from sb3_cpm.run.folder import description
 from sb3_cpm.run.player_losses import player_losses
+from sb3_cpm.run.watcher import Watcher
 from sb3_cpm.seeds import FIRST_SEED
 
 TINY = {
@@ -122,8 +123,8 @@ def test_a_killed_run_goes_on_as_if_unbroken(tmp_path, monkeypatch, agent, kille
         perform(spec, tmp_path / "broken")
     revive()
     loads = []
-    original = single_run_module.checkpoints.load_extra
-    monkeypatch.setattr(single_run_module.checkpoints, "load_extra", lambda path: loads.append(path) or original(path))
+    original = checkpoints.load_extra
+    monkeypatch.setattr(checkpoints, "load_extra", lambda path: loads.append(path) or original(path))
     resumed = perform(spec, tmp_path / "broken")
     assert loads, "started from the beginning instead of the checkpoint"
     assert csv_files(resumed.folder) == csv_files(unbroken.folder)
@@ -305,7 +306,7 @@ def test_diagnosis_changes_nothing(tmp_path, monkeypatch):
     diagnosed = perform(spec, tmp_path / "a")
     names = set(pd.read_csv(diagnosed.folder / "diagnostics.csv")["name"])
     assert {"player/q_D", "player/q_I", "player/critic_loss_I", "player/actor_loss_D"} <= names
-    monkeypatch.setattr(single_run_module, "log_player_losses", lambda model: None)
+    monkeypatch.setattr("sb3_cpm.run.watcher.log_player_losses", lambda model: None)
     plain = perform(spec, tmp_path / "b")
     assert csv_files(diagnosed.folder)["training.csv"] == csv_files(plain.folder)["training.csv"]
     assert csv_files(diagnosed.folder)["evaluations.csv"] == csv_files(plain.folder)["evaluations.csv"]

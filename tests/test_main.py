@@ -8,6 +8,8 @@ from sb3_cpm import __main__ as cli
 from sb3_cpm import __version__
 from sb3_cpm.run.settings import TrainSettings, field_documentation
 
+GIVEN = "What is given on top of cpm_sac.yml, CPMToy-v0"
+
 
 def settings_of(*arguments: str) -> TrainSettings:
     options = vars(cli.make_parser().parse_args(["train", *arguments]))
@@ -63,20 +65,30 @@ def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.Cap
     "options, told",
     [
         (["--seed", "-1"], "seed=-1: expected 0 or more"),
-        (["--model-kwargs", "learning_ratee=1"], "model_kwargs: unknown key 'learning_ratee'. Did you mean 'learning_rate'?"),
-        (["--model-kwargs", "policy_kwargs={net_arc: [4]}"], "model_kwargs: unknown name 'net_arc'"),
+        (["--model-kwargs", "learning_ratee=1"], f"{GIVEN}: unknown key 'learning_ratee'. Did you mean 'learning_rate'?"),
         (
-            ["--env-kwargs", "keyss=[state]"],
-            "env_kwargs: CPMToy-v0 takes no 'keyss'. Did you mean 'keys'? Valid: keys, n_points",
+            ["--model-kwargs", "policy_kwargs={net_arc: [4]}"],
+            f"{GIVEN}, policy_kwargs: unknown key 'net_arc'. Did you mean 'net_arch'?",
         ),
-        (["--buffer-kwargs", "mixx=row"], "buffer_kwargs: unknown key 'mixx'. Did you mean 'mix'?"),
-        (["--buffer-kwargs", "filter_kwargs={widht: 1}"], "filter_kwargs: unknown key 'widht'"),
-        (["--callback-kwargs", "train_frek=1"], "callback_kwargs: unknown key 'train_frek'. Did you mean 'train_freq'?"),
+        (["--env-kwargs", "keyss=[state]"], f"{GIVEN}, env_kwargs: unknown key 'keyss'. Did you mean 'keys'?"),
+        (["--buffer-kwargs", "mixx=row"], f"{GIVEN}, replay_buffer_kwargs: unknown key 'mixx'. Did you mean 'mix'?"),
+        (
+            ["--buffer-kwargs", "filter_kwargs={widht: 1}"],
+            f"{GIVEN}, replay_buffer_kwargs: filter_kwargs: unknown key 'widht'",
+        ),
+        (
+            ["--callback-kwargs", "train_frek=1"],
+            f"{GIVEN}, callback sb3_cpm.ChallengerCallback: unknown key 'train_frek'. Did you mean 'train_freq'?",
+        ),
         (
             ["--callback-kwargs", "uncertainty_kwargs={metrik: log}"],
-            "uncertainty_kwargs: unknown key 'metrik'. Did you mean 'metric'?",
+            f"{GIVEN}, callback sb3_cpm.ChallengerCallback: uncertainty_kwargs: unknown key 'metrik'. Did you mean 'metric'?",
         ),
-        (["--steps", "40"], "steps=40 is no longer than learning_starts=50"),
+        (["--steps", "40"], "steps=40 is no longer than learning_starts=200"),
+        (["--agent", "cpm_sacc"], "Unknown agent 'cpm_sacc'. Did you mean 'cpm_sac'?"),
+        (["--env", "CPMTroy-v0"], "Unknown environment 'CPMTroy-v0'. Did you mean 'CPMToy-v0'?"),
+        (["--device", "cuda:7"], "device='cuda:7' cannot be used here"),
+        (["--resume", "runs/none"], "resume='runs/none' goes on with that run as it is, but env, evaluations came with it"),
     ],
 )
 def test_slips_are_told_and_leave_nothing(

@@ -81,12 +81,16 @@ def test_entries_have_only_keys_that_somebody_takes(name: str, env_id: str) -> N
     if env_id.startswith("PointMaze"):
         pytest.importorskip("gymnasium_robotics")
     agent = load_agent(name, TOY if env_id == "default" else env_id)
-    assert agent.n_timesteps >= 20_000 and agent.n_envs >= 1
+    assert agent.n_timesteps >= 2_000 and agent.n_envs >= 1
 
 
-def test_every_file_has_the_seven_tasks_and_a_default() -> None:
-    assert len(CONFIGS) == 10
+def test_every_file_of_the_report_has_the_seven_tasks_and_a_default() -> None:
+    others = {"cpm_sac_quick", "cpm_td3", "cpm_tqc"}
+    assert len(CONFIGS) == 13
     for path in CONFIGS:
+        if path.stem in others:
+            assert {"default", "CPM/PickCube-v1"} <= set(read_entries(path)), path
+            continue
         assert {"default", *(env_id_of(task) for task in TASKS)} <= set(read_entries(path)), path
 
 
@@ -95,8 +99,9 @@ def test_agents_that_are_compared_differ_in_what_is_compared() -> None:
         read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_high_exploration", "sac")
     )
     for env_id, entry in cpm.items():
-        assert {**entry, "callback": None} == {**slow[env_id], "callback": None}
-        assert entry["callback"] != slow[env_id]["callback"]
+        if env_id in slow:
+            assert {**entry, "callback": None} == {**slow[env_id], "callback": None}
+            assert entry["callback"] != slow[env_id]["callback"]
         if env_id in plain:
             same = set(entry) - {"callback", "replay_buffer_class", "replay_buffer_kwargs", "env_wrapper", "policy"}
             assert {key: entry[key] for key in same} == {key: plain[env_id][key] for key in same}, env_id
@@ -105,8 +110,10 @@ def test_agents_that_are_compared_differ_in_what_is_compared() -> None:
 
 def test_tuned_differs_in_its_challenges_only() -> None:
     simple, tuned = (read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_tuned"))
-    assert set(tuned) == {*simple, ".challenges"}
+    assert set(tuned) == {*simple, ".challenges"} - {"CPMToy-v0"}
     for env_id, entry in simple.items():
+        if env_id not in tuned:
+            continue
         expected = {**entry, "replay_buffer_kwargs": {**entry["replay_buffer_kwargs"], **CHALLENGES["tuned"]}}
         assert tuned[env_id] == expected, env_id
 

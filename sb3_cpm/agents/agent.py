@@ -166,9 +166,12 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     """
     path = find_config(name_or_path)
     ensure_registered(env_id)
-    merged = merge(find_entry(read_entries(path), env_id, path), overrides or {})
+    entry = find_entry(read_entries(path), env_id, path)
+    merged = merge(entry, overrides or {})
     algo = algorithm_of(path.stem)
-    check_hyperparameters(merged, algo, env_id, path)
+    check_hyperparameters(entry, algo, env_id, path)
+    if overrides:
+        check_hyperparameters(merged, algo, env_id, f"What is given on top of {path.name}")
     return Agent(path.stem, algo, env_id, merged, path)
 
 

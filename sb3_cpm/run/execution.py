@@ -150,22 +150,22 @@ class Run:
         if self.options.keep_models and begun:
             jobs += [("the model", self._save_model), ("the challenger", self._save_challenger)]
             jobs += [("the replay buffer", self._save_replay_buffer)]
-        jobs += [("the tables", self.watcher.close), ("the logs", self.model.logger.close)]
+        jobs += [("the tables", self.watcher.close), ("the logs", self._close_logs)]
         if self.options.pictures and begun:
             jobs += self._drawings()
         if self.options.video and finished:
             jobs.append(("the video", self._film))
         jobs += [("the environments", self.built.env.close), ("the evaluation environment", self.eval_env.close)]
         with self.watcher.stopwatch.section("pictures and saving"):
-            for what, job in jobs:
-                _attempt(what, job)
+            whole = all([_attempt(what, job) for what, job in jobs])
         summary = self.summary = self._summary(outcome)
         if self.options.pictures and begun:
             _attempt("the summary", lambda: summary.write(self.folder))
         if finished:  # last: a process that is killed before goes on
             facts = {"steps": self.model.num_timesteps, "seconds": round(self.watcher.seconds, 1), "sb3_cpm": __version__}
             run_folder.write_finished(self.folder, facts)
-            checkpoints.remove_checkpoints(self.folder)
+            if whole:  # else the last good model may be there
+                checkpoints.remove_checkpoints(self.folder)
         return summary
 
     def _drawings(self) -> list[tuple[str, Callable[[], Any]]]:
@@ -183,6 +183,10 @@ class Run:
                 ("the challenge gallery", lambda: challenge_gallery(path, recorder.shots.choose(), title)),
             ]
         return drawings
+
+    def _close_logs(self) -> None:
+        with disk_errors_named(self.folder):
+            self.model.logger.close()
 
     def _save_model(self) -> None:
         checkpoints.save_model(self.folder / "model.zip", self.model)
@@ -309,13 +313,16 @@ def _describe_end(error: BaseException) -> str:
     return f"ended by {type(error).__name__}: {error}"
 
 
-def _attempt(what: str, job: Callable[[], Any]) -> None:
+def _attempt(what: str, job: Callable[[], Any]) -> bool:
+    """:return: whether it succeeded; if not, that is told"""
     try:
         job()
+        return True
     except (NotWrittenError, NotFiniteError) as error:
         print(f"Could not write {what}: {error}", file=sys.stderr, flush=True)
     except Exception:
         print(f"Could not write or close {what}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+    return False
 
 
 def _patient_log(kind: str, folder: Path) -> KVWriter:
