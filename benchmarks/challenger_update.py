@@ -41,7 +41,7 @@ def measure(kind: str, updates: int) -> dict[str, float]:
     cameras, state_dim, action_dim = SIZES[kind]
     space = make_space(32, cameras, state_dim)
     challenger = Challenger(space, spaces.Box(-1.0, 1.0, (action_dim,), np.float32), "cpu")
-    batch = make_batch(space, challenger.preset, action_dim)
+    batch = make_batch(space, (challenger.sequence_length, challenger.batch_size), action_dim)
     for _ in range(3):
         challenger.train(batch)
     seconds = []

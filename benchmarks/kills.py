@@ -143,9 +143,8 @@ def main() -> int:
                 most = max(costs, default=0)
                 failed += counts["DIFFERENT"] + (most > (EVERY if front == "train" else STEPS))
                 told = ", ".join(f"{name} {count}" for name, count in counts.items())
-                print(
-                    f"{front} {number.name}: {told}; a kill cost at most {most} steps ({seconds:.0f} s unbroken)", flush=True
-                )
+                cost = f"a kill cost at most {most} steps ({seconds:.0f} s unbroken)"
+                print(f"{front} {number.name}: {told}; {cost}", flush=True)
     return 1 if failed else 0
 
 

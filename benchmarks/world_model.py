@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
 import gymnasium
@@ -45,8 +45,11 @@ from clock import Clock, Enough, Lap, clocked, median, timed
 from gymnasium import spaces
 
 from sb3_cpm.challenger import Challenger
-from sb3_cpm.presets import Preset, make_preset
+from sb3_cpm.presets import make_preset
 from sb3_cpm.type_aliases import SequenceBatch
+
+if TYPE_CHECKING:  # earlier versions, which benchmarks are run against, have none
+    from sb3_cpm.presets import Preset
 
 ACTION_DIM, STATE_DIM = 7, 29
 STEP_SECONDS = 0.013  # of PickCube-v1 with light rendering on one core
@@ -102,10 +105,15 @@ def make_space(size: int, cameras: int, state_dim: int = STATE_DIM) -> spaces.Di
     return spaces.Dict({**images, "state": spaces.Box(-np.inf, np.inf, (state_dim,), np.float32)})
 
 
-def make_batch(space: spaces.Dict, preset: Preset, action_dim: int = ACTION_DIM) -> SequenceBatch:
-    """Whole sequences of noise; what is in them does not change what they cost."""
+def make_batch(space: spaces.Dict, shape: tuple[int, int], action_dim: int = ACTION_DIM) -> SequenceBatch:
+    """
+    Whole sequences of noise; what is in them does not change what they cost.
+
+    :param space: observation space
+    :param shape: rows per sequence, sequences
+    :param action_dim: size of the action
+    """
     rng = np.random.default_rng(0)
-    shape = preset.sequence_length, preset.batch_size
     observations = {
         key: rng.integers(0, 256, (*shape, *sub.shape), dtype=np.uint8)
         if sub.dtype == np.uint8
@@ -130,7 +138,7 @@ class Ours:
     :param device: where it trains
     """
 
-    def __init__(self, space: spaces.Dict, preset: Preset, device: str) -> None:
+    def __init__(self, space: spaces.Dict, preset: "Preset", device: str) -> None:
         torch.manual_seed(0)
         box = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self.challenger = Challenger(space, box, device, preset)
@@ -163,7 +171,7 @@ class Ours:
         return {name: sum(parameter.numel() for parameter in part.parameters()) for name, part in parts.items()}
 
 
-def make_peer(preset: Preset, space: spaces.Dict, **kwargs: Any) -> Any:
+def make_peer(preset: "Preset", space: spaces.Dict, **kwargs: Any) -> Any:
     """sheeprl at the sizes of a preset; None if it is not installed."""
     if not PEER:
         return None
@@ -253,7 +261,7 @@ def measure_dreamer(options: Options, size: int, cameras: int, target: float, be
         layers = {"cnn_layers": 3 if size == 32 else 4, "sequence_length": options.length}
         dreamer = {"train_task_behavior": True, "train_exploration_behavior": False}
         preset = make_preset("report", **CATEGORICAL, **variant.switches, **layers, **dreamer)
-        ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
+        ours, batch = Ours(space, preset, options.device), make_batch(space, (preset.sequence_length, preset.batch_size))
         peer = make_peer(preset, space, own_convolutions=own, **variant.other)
         if not own:
             print_sizes(f"{size}x{size}x{3 * cameras}", ours.parameters(), peer)
@@ -292,7 +300,7 @@ def measure_ensemble(options: Options) -> list[Pair]:
     heads = {"plan2explore": {"heads": 10, "layers": 4, "units": 400, "target": "stoch", "metric": "exp"}}
     for variant in variants(options):
         preset = make_preset("report", **CATEGORICAL, **variant.switches, cnn_layers=3, uncertainty=heads)
-        ours, batch = Ours(space, preset, options.device), make_batch(space, preset)
+        ours, batch = Ours(space, preset, options.device), make_batch(space, (preset.sequence_length, preset.batch_size))
         peer = make_peer(preset, space, ensemble=True, **variant.other)
         print_sizes("ensemble", ours.parameters(), peer)
         warm_up(ours, batch, 3)
@@ -316,7 +324,7 @@ def measure_latents(options: Options) -> list[Pair]:
     for name, switches, _ in variants(options):
         gaussian, categorical = make_preset("report", **switches), make_preset("report", **CATEGORICAL, **switches)
         ours, other = Ours(space, gaussian, options.device), Ours(space, categorical, options.device)
-        batch = make_batch(space, gaussian)
+        batch = make_batch(space, (gaussian.sequence_length, gaussian.batch_size))
         for one in (ours, other):
             warm_up(one, batch)
         target = 2.5 if options.device == "cpu" else None

@@ -2,9 +2,10 @@
 Disagreement of dynamics models in observation space (Pathak et al. 2019, section 3): K networks predict the embedding of the
 next observation from the embedding of this one and the action. They never see the world model's latent.
 
-Beside Plan2Explore it shows what the latent is good for: a model without memory takes whatever an observation hides for
-noise. It averages over that and does not disagree about it, so novelty that depends on the past goes unnoticed; in exchange
-its inputs do not change with the world model's memory. Embeddings are standardised with running statistics.
+What the latent of a world model does not know, because it was never trained on it, it maps to what it knows; an ensemble that
+reads latents then hardly tells new states from known ones (docs/world_model.md), and this one does. What a latent is good for
+is memory: a model without one takes whatever an observation hides for noise. It averages over that and does not disagree about
+it, so novelty that depends on the past goes unnoticed. Embeddings are standardised with running statistics.
 
 **What it rates in imagination.** A disagreement needs no outcome, only the observation that is left; where nothing was
 observed, that is the one which the imagined latent suggests, see :mod:`sb3_cpm.uncertainty.parts`. The actor's gradient comes
@@ -16,9 +17,9 @@ from typing import Any
 import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.ensemble import Ensemble, ensemble_loss
+from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
 from sb3_cpm.uncertainty.parts import DreamtEmbedding
-from sb3_cpm.uncertainty.scale import ScaledUncertainty
+from sb3_cpm.uncertainty.scale import ScaledUncertainty, some_of
 
 
 class ObservationEnsemble(ScaledUncertainty):
@@ -27,32 +28,62 @@ class ObservationEnsemble(ScaledUncertainty):
     :param heads: K
     :param layers: hidden layers of each head
     :param units: size of each of them
+    :param dims: embeddings with more dimensions are projected to so many by a random rotation, which keeps distances; None:
+        never. Images have embeddings of thousands, which every head would have to predict
     :param scale: metric and dynamic scale, see :class:`~sb3_cpm.uncertainty.scale.ScaledUncertainty`
     :raises ValueError: for unknown metrics, fewer than two heads
     """
 
-    def __init__(self, sizes: LatentSizes, heads: int = 5, layers: int = 2, units: int = 400, **scale: Any) -> None:
+    rotation: th.Tensor | None
+
+    def __init__(
+        self, sizes: LatentSizes, heads: int = 5, layers: int = 2, units: int = 400, dims: int | None = None, **scale: Any
+    ) -> None:
         super().__init__(sizes, **scale)
-        self.dream = DreamtEmbedding(sizes.feat, sizes.embed, units)
-        self.ensemble = Ensemble(heads, sizes.embed + sizes.action, sizes.embed, layers, units)
+        projected = dims is not None and dims < sizes.embed
+        embed = dims if projected else sizes.embed
+        assert embed is not None
+        rotation = th.linalg.qr(th.randn(sizes.embed, embed))[0] if projected else None
+        self.register_buffer("rotation", rotation)  # (sizes.embed, dims), orthonormal columns
+        self.dream = DreamtEmbedding(sizes.feat, embed, units)
+        self.ensemble = Ensemble(heads, embed + sizes.action, embed, layers, units)
+        self._rated: tuple[th.Tensor | None, th.Tensor | None] = None, None
 
     def predict(self, transitions: Transitions) -> list[th.Tensor]:
-        """Predicted standardised embeddings of all heads, each of shape ``(*batch, embed_dim)``."""
+        """Predicted standardised embeddings of all heads, each of shape ``(*batch, dims)``."""
         return self.ensemble.predictions(self._inputs(transitions))
 
     def raw(self, transitions: Transitions) -> th.Tensor:
         return self.ensemble.disagreement(self._inputs(transitions))
 
     def _inputs(self, transitions: Transitions) -> th.Tensor:
-        return th.cat((self.dream(transitions.feat, transitions.embed), transitions.action), dim=-1)
+        embed = None if transitions.embed is None else self._projected(transitions.embed)
+        return th.cat((self.dream(transitions.feat, embed), transitions.action), dim=-1)
+
+    def _projected(self, embed: th.Tensor) -> th.Tensor:
+        """
+        :param embed: shape ``(*batch, sizes.embed)``
+        :return: shape ``(*batch, dims)``
+        """
+        return embed if self.rotation is None else embed @ self.rotation
 
     def loss(self, transitions: Transitions) -> th.Tensor:
         assert transitions.embed is not None and transitions.next_embed is not None, "only real transitions have embeddings"
-        loss = ensemble_loss(self.predict(transitions), self.dream.norm(transitions.next_embed))
-        return loss + self.dream.loss(transitions.feat, transitions.embed)
+        embed, targets = (self.dream.norm(self._projected(one)) for one in (transitions.embed, transitions.next_embed))
+        predictions = self.ensemble.predictions(th.cat((embed, transitions.action), dim=-1))
+        with th.no_grad():
+            rows = some_of(len(embed))
+            self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
+        return ensemble_loss(predictions, targets) + self.dream.loss(transitions.feat, embed)
+
+    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
+        """Of the transitions learnt from last, as the heads predicted then: that needs no further prediction."""
+        feat, raw = self._rated
+        self._rated = None, None
+        return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
 
     @th.no_grad()
     def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
         assert transitions.next_embed is not None
-        self.dream.norm.update(transitions.next_embed)
+        self.dream.norm.update(self._projected(transitions.next_embed))
         return super().adapt(transitions)

@@ -78,6 +78,10 @@ class DreamtEmbedding(nn.Module):
         """
         return self.head(feat) if embed is None else self.norm(embed)
 
-    def loss(self, feat: th.Tensor, embed: th.Tensor) -> th.Tensor:
-        """Squared error of dreaming real states, summed over the dimensions."""
-        return 0.5 * (self.head(feat) - self.norm(embed)).square().sum(-1).mean()
+    def loss(self, feat: th.Tensor, standard: th.Tensor) -> th.Tensor:
+        """
+        :param feat: latents, shape ``(n, feat_dim)``
+        :param standard: standardised embeddings, shape ``(n, embed_dim)``
+        :return: squared error of dreaming real states, summed over the dimensions
+        """
+        return 0.5 * (self.head(feat) - standard).square().sum(-1).mean()

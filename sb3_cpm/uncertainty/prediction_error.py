@@ -85,7 +85,7 @@ class PredictionError(ScaledUncertainty):
             loss = self.forward_share * loss + (1.0 - self.forward_share) * inverse
         if self.dream is not None:
             assert transitions.next_embed is not None, "only real transitions have an embedding"
-            loss = loss + self.dream.loss(transitions.next_feat, transitions.next_embed)
+            loss = loss + self.dream.loss(transitions.next_feat, self.dream.norm(transitions.next_embed))
         return loss
 
     def _predict(self, transitions: Transitions) -> th.Tensor:

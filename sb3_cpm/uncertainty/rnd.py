@@ -69,7 +69,7 @@ class RandomNetworkDistillation(ScaledUncertainty):
         loss = 0.5 * self._error(transitions).square().sum(-1).mean()
         if self.dream is not None:
             assert transitions.next_embed is not None, "only real transitions have an embedding"
-            loss = loss + self.dream.loss(transitions.next_feat, transitions.next_embed)
+            loss = loss + self.dream.loss(transitions.next_feat, self.dream.norm(transitions.next_embed))
         return loss
 
     def _error(self, transitions: Transitions) -> th.Tensor:
