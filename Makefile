@@ -30,7 +30,7 @@ RUN := $(BIN)python -m
 export OMP_NUM_THREADS ?= 1
 
 help:
-	@echo "make train           set up, train CPM-SAC on PickCube-v1, leave a folder of results in runs/"
+	@echo "make train           set up, train CPM-SAC on PickCube-v1 (shortened: agent cpm_sac_quick), leave results in runs/"
 	@echo "make pytest          set up, run all tests"
 	@echo "make sb3-tests       fetch SB3's own tests, which \`make pytest\` runs with our buffer, too, where they are"
 	@echo "                     (neither changes the system: RENDERING=system installs a Vulkan driver for the whole machine)"
@@ -39,7 +39,7 @@ help:
 	@echo "make venv, make clean-venv"
 
 train: $(READY) $(PROBED)
-	$(RUN) sb3_cpm train $(ARGS)
+	$(RUN) sb3_cpm train --agent cpm_sac_quick $(ARGS)
 
 # Workers share the cores; tests/conftest.py says how many: none for a single file. `-p no:xdist` takes the option away, too.
 pytest: $(READY) $(PROBED)
@@ -66,7 +66,7 @@ $(VENV)/bin/python:
 	@python="$$(scripts/find_python.sh "$(PYTHON)")" && "$$python" --version && \
 		{ "$$python" -m venv $(VENV) || { rm -f $@; exit 1; }; }
 
-$(VENV)/.installed: setup.cfg constraints.txt | $(VENV)/bin/python
+$(VENV)/.installed: setup.cfg setup.py constraints.txt | $(VENV)/bin/python
 	@echo "==> Installing sb3_cpm[$(EXTRAS)] with the versions of constraints.txt (about 3 minutes)"
 	@# MuJoCo 4, which constraints.txt once named, leaves files of its parts in the folder of an earlier release
 	@if $(BIN)python -m pip show -q mujoco-core 2>/dev/null; then \

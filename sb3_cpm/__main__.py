@@ -13,6 +13,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from sb3_cpm import __version__
+from sb3_cpm.extras import install_command, needed
 from sb3_cpm.run.settings import TrainSettings, field_documentation
 
 EPILOG = """examples:
@@ -192,19 +193,15 @@ class _KeyValues(argparse.Action):
 
 
 def _train(**settings: Any) -> int:
-    try:
+    with needed("Runs", "run"):
         from sb3_cpm.run.training import train
-    except ImportError as error:
-        raise RuntimeError(f'Training needs a package that is missing ({error}): pip install "sb3_cpm[run]"') from error
     train(TrainSettings(**settings))
     return 0
 
 
 def _watch(**arguments: Any) -> int:
-    try:
+    with needed("Pictures of dreams", "run"):
         from sb3_cpm.run.watch import watch
-    except ImportError as error:
-        raise RuntimeError(f'Watching needs a package that is missing ({error}): pip install "sb3_cpm[run]"') from error
     watched = watch(**arguments)
     print(watched.text)
     print("\nDrawn: " + ", ".join(str(file) for file in watched.files))
@@ -213,15 +210,14 @@ def _watch(**arguments: Any) -> int:
 
 def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
     try:
-        from sb3_cpm import experiments
+        # also what only the runs need: they are counted before anything else is done
+        with needed("Experiments", "experiments"):
+            from sb3_cpm import experiments
 
-        if list or figure is None:
-            print(experiments.listing())
-            return 0
-        return experiments.reproduce(figure, **arguments)
-    except ImportError as error:  # also of what only the runs need: they are counted before anything else is done
-        cure = 'pip install "sb3_cpm[experiments]"'
-        raise RuntimeError(f"Experiments need a package that is missing ({error}): {cure}") from error
+            if list or figure is None:
+                print(experiments.listing())
+                return 0
+            return experiments.reproduce(figure, **arguments)
     except BrokenPipeError:
         raise
     except OSError as error:  # a disk that is full or must not be written; what was written before stays
@@ -253,7 +249,8 @@ def _assets(env_ids: list[str], download: bool) -> int:
                 print(line, flush=True)
         rows = list(assets.report(env_ids))
     except ImportError as error:
-        raise RuntimeError(f"The tasks need a package that is missing ({error}): pip install 'sb3_cpm[maniskill]'") from error
+        cure = install_command("maniskill")
+        raise RuntimeError(f"The tasks need a package that is missing ({error}): {cure}") from error
     for _, line in rows:
         print(line)
     return 0 if all(ready for ready, _ in rows) else 1

@@ -1,8 +1,15 @@
-"""Packages that come with an extra of setup.cfg: what is said where one is missing."""
+"""
+Packages that come with an extra of setup.cfg, and what is said where one is missing: a command that works where it is read.
+
+In a checkout it installs the checkout. Elsewhere it names the packages themselves, since whoever got a wheel from somewhere
+has no registry that knows ``sb3_cpm``.
+"""
 
 import contextlib
 import importlib.util
+import re
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 
 class MissingExtra(ImportError, ValueError):
@@ -40,4 +47,63 @@ def check_installed(what: str, packages: Sequence[str], extra: str) -> None:
 
 def missing(what: str, package: str, extra: str) -> MissingExtra:
     """:return: the error that says so"""
-    return MissingExtra(f'{what} need {package}, which is not installed: pip install "sb3_cpm[{extra}]"', name=package)
+    return MissingExtra(f"{what} need {package}, which is not installed: {install_command(extra)}", name=package)
+
+
+# ---------------------------------------------------------------------- what to type
+
+
+def checkout() -> Path | None:
+    """:return: the folder of the checkout, or of the unpacked source distribution, that this package lies in"""
+    folder = Path(__file__).resolve().parents[1]
+    return folder if (folder / "setup.cfg").is_file() and (folder / "zoo_configs").is_dir() else None
+
+
+def install_command(*extras: str) -> str:
+    """
+    The one place that says how something is installed.
+
+    :param extras: of setup.cfg; none: what the package itself needs
+    :return: a command that installs what is missing of them, in a checkout and without one
+    """
+    folder = checkout()
+    if folder is not None:
+        names = f"[{','.join(extras)}]" if extras else ""
+        return f'pip install -c "{folder / "constraints.txt"}" -e "{folder}{names}"'
+    wanted = _requirements("sb3_cpm", "", *extras)
+    # none missing: one is broken, or older than this package wants
+    chosen = [requirement for requirement in wanted if not _is_installed(requirement)] or wanted
+    if not chosen:  # a bare copy of the folder: nothing says what it needs
+        return "install sb3_cpm itself, from its wheel or from a checkout"
+    return " ".join(["pip install", *(f'"{requirement}"' for requirement in chosen)])
+
+
+def _requirements(distribution: str, *extras: str) -> list[str]:
+    """What an installed distribution says that its extras bring, "" being what it needs itself; nothing if it is not there."""
+    from importlib import metadata  # as long to import as all that `--help` needs
+
+    try:
+        lines = metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        return []
+    split = [[part.strip() for part in line.partition(";")[::2]] for line in lines]  # name and versions, condition
+    return [requirement for requirement, condition in split if _extra_of(condition) in extras]
+
+
+def _extra_of(condition: str) -> str:
+    named = re.search(r"""\bextra\s*==\s*["']([^"']+)""", condition)
+    return named[1] if named else ""
+
+
+def _is_installed(requirement: str) -> bool:
+    """Whatever its version; with what its own extras bring, as ffmpeg for ``imageio[ffmpeg]>=2.34``."""
+    from importlib import metadata
+
+    matched = re.match(r"([\w.-]+)(?:\[([^]]*)\])?", requirement)
+    assert matched is not None, requirement
+    name, extras = matched[1], [extra.strip() for extra in (matched[2] or "").split(",")]
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return all(_is_installed(one) for one in _requirements(name, *filter(None, extras)))

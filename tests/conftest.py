@@ -33,6 +33,7 @@ LONGEST = (
     "test_sb3_own_tests.py",
     "test_uncertainty_classes.py",
     "test_run.py",
+    "test_wheel.py",
     "test_rendering.py",
 )
 

@@ -10,6 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sb3_cpm.extras import install_command
+
 #: One task of every kind, as far as suites differ in how they use MuJoCo.
 SUITES = {
     "gymnasium_robotics": (
@@ -55,7 +57,7 @@ def make(suite: str, task: str) -> gym.Env:
 def test_tasks_of_the_suites_can_be_made(suite: str, task: str) -> None:
     for package in (suite, *(["shimmy"] if suite == "dm_control" else [])):
         if importlib.util.find_spec(package) is None:
-            pytest.skip(f'{package} is not installed: pip install -c constraints.txt "sb3_cpm[benchmarks]"')
+            pytest.skip(f"{package} is not installed: {install_command('benchmarks')}")
     env = make(suite, task)
     try:
         env.reset(seed=0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from sb3_cpm.extras import install_command
 from sb3_cpm.machine import doctor, rendering
 from sb3_cpm.machine.memory import memory_gib
 
@@ -61,7 +62,7 @@ def test_without_maniskill_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(doctor, "_package", without)
     monkeypatch.setattr(rendering, "probe_renderer", never)
     findings = {finding.what: finding for finding in doctor.examine()}
-    assert not findings["SAPIEN renders"].well and "sb3_cpm[maniskill]" in findings["SAPIEN renders"].cure
+    assert not findings["SAPIEN renders"].well and findings["SAPIEN renders"].cure == install_command("maniskill")
 
 
 def test_submodules_are_attributes() -> None:
@@ -75,7 +76,7 @@ def test_the_package_imports_without_maniskill() -> None:
     code = """
 import sys
 sys.modules["mani_skill"] = sys.modules["sapien"] = None  # as if not installed
-import sb3_cpm, sb3_cpm.envs, sb3_cpm.machine.doctor
+import sb3_cpm, sb3_cpm.envs, sb3_cpm.extras, sb3_cpm.machine.doctor
 from sb3_cpm.machine import rendering
 import importlib.util
 found = importlib.util.find_spec
@@ -83,7 +84,7 @@ importlib.util.find_spec = lambda name: None if name in ("mani_skill", "sapien")
 try:
     sb3_cpm.envs.make_maniskill_env("PickCube-v1")
 except ImportError as error:
-    assert 'pip install "sb3_cpm[maniskill]"' in str(error), error
+    assert sb3_cpm.extras.install_command("maniskill") in str(error), error
     print("said so")
 """
     child = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=600)

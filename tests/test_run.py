@@ -11,23 +11,23 @@ import pytest
 import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_cpm.agents.tasks import task_id
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer
-from sb3_cpm.envs import DictObservation
 from sb3_cpm.run import TrainSettings, train
-from sb3_cpm.run import environment as environments
-from sb3_cpm.run.environment import make_env
-from sb3_cpm.run.evaluation import play_episode
-from sb3_cpm.run.folder import RunFolder
-from sb3_cpm.run.plots import read_csv, running_mean
-from sb3_cpm.run.recorder import CSVTable
+from sb3_cpm.run.evaluation import evaluate
+from sb3_cpm.run.folder import NewFolder
+from sb3_cpm.run.plots import running_mean
+from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import Summary, complete_times
-from sb3_cpm.run.training import make_model
+from sb3_cpm.run.tables import GrownTable, read_csv, read_diagnostics
+from sb3_cpm.run.training import specification
 from sb3_cpm.seeds import FIRST_SEED
 
 SMALL: dict[str, Any] = {
@@ -101,28 +101,29 @@ def test_folder_of_a_finished_run(finished: tuple[Path, Summary]) -> None:
     folder, _ = finished
     check_pictures(folder)
     check_loadable(folder)
-    assert yaml.safe_load((folder / "config.yml").read_text())["env"] == "CPMToy-v0"
-    assert yaml.safe_load((folder / "versions.yml").read_text())["stable_baselines3"]
-    assert (folder / "progress.csv").stat().st_size > 0
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    assert config["run"]["env_id"] == "CPMToy-v0" and config["versions"]["stable_baselines3"]
+    assert "challenger/world_model_loss" in read_diagnostics(folder)
+    assert (folder / "finished.yml").exists() and not (folder / "checkpoint").exists()
     assert not list(folder.glob(".*")), "no temporary file stays behind"
 
 
 def test_config_repeats_the_run(finished: tuple[Path, Summary]) -> None:
     folder, _ = finished
-    settings = TrainSettings(**yaml.safe_load((folder / "config.yml").read_text()))
-    assert settings == settings.resolved()
-    assert settings.gamma == 0.9
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    spec, agent = specification(TrainSettings(**SMALL))
+    assert RunSpec(**config["run"]) == spec
+    assert config["protocol"]["hyperparameters"] == agent.hyperparameters
+    assert agent.hyperparameters["gamma"] == 0.9 and agent.hyperparameters["batch_size"] == 16
 
 
 def test_tables_of_a_finished_run(finished: tuple[Path, Summary]) -> None:
     folder, summary = finished
-    episodes = read_csv(folder / "episodes.csv")
+    episodes = read_csv(folder / "training.csv")
     assert list(episodes["step"]) == list(range(50, 501, 50))
-    assert np.all((episodes["explored_share"] >= 0) & (episodes["explored_share"] <= 1))
-    assert episodes["explored_share"].mean() == pytest.approx(summary.explored_share)
     evaluations = read_csv(folder / "evaluations.csv")
-    assert list(evaluations["step"]) == [0, 500]
-    assert np.all(evaluations["min_return"] <= evaluations["mean_return"])
+    assert list(evaluations["step"]) == [0, 0, 500, 500]
+    assert evaluations["return"][2:].mean() == pytest.approx(summary.mean_return)
     proposals = read_csv(folder / "proposals.csv")
     assert len(proposals["step"]) == summary.proposed > 0
     assert proposals["accepted"].sum() == summary.kept
@@ -130,6 +131,8 @@ def test_tables_of_a_finished_run(finished: tuple[Path, Summary]) -> None:
     assert np.array_equal(np.isfinite(proposals["artificial_total"]), accepted), "only what was kept has new rewards"
     coefficients = read_csv(folder / "coefficients.csv")
     assert coefficients["proposed"][-1] == summary.proposed
+    shares = coefficients["explored_share"]
+    assert np.all((shares >= 0) & (shares <= 1)) and shares.mean() == pytest.approx(summary.explored_share)
     assert np.all(np.diff(coefficients["epsilon"]) <= 0)
     curve = (folder / "learning_curve.csv").read_text().splitlines()
     assert curve[0] == "step,kind,return,success"
@@ -167,15 +170,14 @@ def test_never_overwrites(finished: tuple[Path, Summary], monkeypatch: pytest.Mo
     with pytest.raises(ValueError, match="not empty"):
         train(run_folder=str(folder), **SMALL)
     monkeypatch.chdir(tmp_path)
-    names = [RunFolder(TrainSettings(env="CPMToy-v0")).path.name for _ in range(3)]
-    assert names == ["CPMToy-v0-sac-seed0", "CPMToy-v0-sac-seed0-2", "CPMToy-v0-sac-seed0-3"]
+    assert [NewFolder(None, "toy").path.name for _ in range(3)] == ["toy", "toy-2", "toy-3"]
 
 
 @pytest.mark.slow
 def test_same_seed_same_run_whether_it_is_evaluated_or_not(tmp_path: Path) -> None:
     for name, evaluations in (("one", 0), ("other", 3)):
         train(run_folder=str(tmp_path / name), **{**SMALL, "steps": 300, "evaluations": evaluations, "video": False})
-    for table in ("episodes.csv", "proposals.csv", "coefficients.csv"):
+    for table in ("training.csv", "proposals.csv", "coefficients.csv"):
         assert (tmp_path / "one" / table).read_text() == (tmp_path / "other" / table).read_text()
 
 
@@ -186,15 +188,15 @@ def test_everything_is_kept_when_a_run_is_ended(
     error: BaseException, outcome: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed = []
-    close = environments.DummyVecEnv.close
-    monkeypatch.setattr(environments.DummyVecEnv, "close", lambda env: (closed.append(env), close(env)))
+    close = DummyVecEnv.close
+    monkeypatch.setattr(DummyVecEnv, "close", lambda env: (closed.append(env), close(env)))
     folder = tmp_path / "run"
     with pytest.raises(type(error)):
         train(TrainSettings(run_folder=str(folder), **SMALL), callback=StopAt(330, error))
-    assert len(closed) == 1
+    assert len(closed) == 2, "of training and of evaluation"
     check_pictures(folder)
     check_loadable(folder)
-    assert list(read_csv(folder / "episodes.csv")["step"]) == [50, 100, 150, 200, 250, 300]
+    assert list(read_csv(folder / "training.csv")["step"]) == [50, 100, 150, 200, 250, 300]
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["steps"] == 330
     assert outcome in summary["outcome"]
@@ -217,45 +219,30 @@ def test_bad_settings_leave_no_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        *({"algorithm": "ppo"}, {"n_envs": 0}, {"steps": 0}, {"evaluations": -1}, {"eval_episodes": 0}, {"threads": 0}),
-        *({"seed": -1}, {"seed": FIRST_SEED}, {"seed": FIRST_SEED - 2, "n_envs": 2}),
+        *({"n_envs": 0}, {"steps": 0}, {"evaluations": -1}, {"evaluations": 1}, {"eval_episodes": 0}, {"threads": 0}),
+        *({"seed": -1}, {"seed": FIRST_SEED}, {"seed": FIRST_SEED - 2, "n_envs": 2}, {"checkpoint_freq": 0}),
     ],
 )
 def test_settings_are_checked(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        TrainSettings(**wrong)
+        specification(TrainSettings(**{"env": "CPMToy-v0", **wrong}))
 
 
 def test_the_greatest_seed_is_none_of_the_evaluation() -> None:
-    seed = FIRST_SEED - 3
-    assert TrainSettings(seed=seed, n_envs=2).seed == seed
-    env = environments.make_vec_env("CPMToy-v0", 1, FIRST_SEED)
-    assert np.array_equal(env.reset()["state"][0], make_env("CPMToy-v0").reset(seed=FIRST_SEED)[0]["state"])  # what is refused
-
-
-@pytest.mark.parametrize("steps, expected", [(2000, 200), (400, 200), (150, 75), (80, 50)])
-def test_a_short_run_learns_from_its_middle_on(steps: int, expected: int) -> None:
-    settings = TrainSettings(env="CPMToy-v0", steps=steps, device="cpu").resolved()
-    assert make_model(settings, environments.make_vec_env("CPMToy-v0", 1, 0)).learning_starts == expected
-
-
-@pytest.mark.parametrize("steps, n_envs, expected", [(1500, 1, 1500), (600, 1, 1000), (2500, 3, 3000), (30_000, 1, 20_000)])
-def test_a_buffer_of_the_run_s_choice_is_never_refused(steps: int, n_envs: int, expected: int) -> None:
-    settings = TrainSettings(env="CPMToy-v0", steps=steps, n_envs=n_envs, device="cpu").resolved()
-    env = environments.make_vec_env("CPMToy-v0", 1, 0)
-    assert make_model(settings, env).replay_buffer.buffer_size == expected  # type: ignore[union-attr]
-    long = make_vec_env("Pendulum-v1", 1, env_kwargs={"max_episode_steps": 30_000}, wrapper_class=DictObservation)
-    assert make_model(settings, long).replay_buffer.buffer_size == 60_000  # type: ignore[union-attr]
+    settings = TrainSettings(env="CPMToy-v0", seed=FIRST_SEED - 3, n_envs=2)
+    built = specification(settings)[1].build(settings.seed, device="cpu")
+    starts = built.env.reset()["state"]
+    evaluation, _ = gym.make("CPMToy-v0").reset(seed=FIRST_SEED)
+    assert not np.isclose(starts, evaluation["state"]).all(-1).any()
+    built.env.close()
 
 
 def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    with pytest.raises(ValueError, match=r"steps=50 is no longer than learning_starts=50, .* Set steps above 50\.$"):
-        train(run_folder=str(folder), **{**SMALL, "steps": 50, "learning_starts": None})
-    with pytest.raises(ValueError, match="Set steps above 100, or learning_starts lower, to 50 at least"):
+    with pytest.raises(ValueError, match=r"steps=100 is no longer than learning_starts=100, .* Set steps above 100, or"):
         train(run_folder=str(folder), **{**SMALL, "steps": 100})
     assert not folder.exists()
-    shortest = {**SMALL, "steps": 80, "learning_starts": None, "evaluations": 0, "video": False}
+    shortest = {**SMALL, "steps": 120, "evaluations": 0, "video": False}
     assert train(run_folder=str(folder), **shortest).player_updates > 0
 
 
@@ -269,15 +256,15 @@ def test_module_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     changes = {"env": "brings_a_task:Brought-v0", "steps": 60, "learning_starts": 40, "evaluations": 0}
     summary = train(**{**SMALL, **changes})
-    assert Path(summary.folder) == Path("runs/Brought-v0-sac-seed0") and summary.episodes == 3
+    assert Path(summary.folder) == Path("runs/Brought-v0-cpm_sac-seed0") and summary.episodes == 3
     with pytest.raises(ValueError, match=r"brings_a_task registers no 'Braught-v0'\. Did you mean 'Brought-v0'"):
-        make_env("brings_a_task:Braught-v0")
+        train(env="brings_a_task:Braught-v0")
     with pytest.raises(ValueError, match="cannot import 'brings_no_task'"):
-        make_env("brings_no_task:Brought-v0")
+        train(env="brings_no_task:Brought-v0")
 
 
 def test_two_processes_and_tqc(tmp_path: Path) -> None:
-    changes = {"n_envs": 2, "algorithm": "tqc", "steps": 300, "evaluations": 0, "video": False}
+    changes = {"n_envs": 2, "agent": "cpm_tqc", "steps": 300, "evaluations": 0, "video": False}
     summary = train(run_folder=str(tmp_path / "run"), **{**SMALL, **changes})
     assert (summary.steps, summary.episodes) == (300, 6)
     assert summary.success is None and summary.mean_return is None
@@ -287,7 +274,7 @@ def test_two_processes_and_tqc(tmp_path: Path) -> None:
 
 def test_vectors_only_with_td3_and_progress_bar(tmp_path: Path) -> None:
     """Pendulum has a Box, no images, no success and no clouds; the gallery says so instead of failing."""
-    changes = {"env": "Pendulum-v1", "algorithm": "td3", "steps": 450, "learning_starts": 200, "progress_bar": True}
+    changes = {"env": "Pendulum-v1", "agent": "cpm_td3", "steps": 450, "learning_starts": 200, "progress_bar": True}
     summary = train(run_folder=str(tmp_path / "run"), **{**SMALL, **changes})
     assert summary.steps == 450
     assert summary.success is None
@@ -303,15 +290,17 @@ def test_images_only(tmp_path: Path) -> None:
     assert gallery.std() > 1, "without proposals it says why it is empty"
 
 
-def test_discrete_actions_are_refused() -> None:
-    with pytest.raises(ValueError, match="Discrete"):
-        environments.make_env("CartPole-v1")
+def test_discrete_actions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"CartPole-v1 has the action space Discrete\(2\)"):
+        train(env="CartPole-v1", run_folder=str(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
 
 
-def test_maniskill_is_told_from_gymnasium() -> None:
-    assert environments.is_maniskill("PickCube-v1")
-    assert not environments.is_maniskill("CPMToy-v0")
-    assert not environments.is_maniskill("Pendulum-v1")
+def test_one_name_per_task() -> None:
+    assert task_id("PickCube-v1") == task_id("CPM/PickCube-v1") == "CPM/PickCube-v1"
+    assert task_id("CPMToy-v0") == "CPMToy-v0" and task_id("Pendulum-v1") == "Pendulum-v1"
+    with pytest.raises(ValueError, match=r"Unknown environment 'PikCube-v1'\. Did you mean 'PickCube-v1'"):
+        task_id("PikCube-v1")
 
 
 @pytest.mark.slow
@@ -329,10 +318,10 @@ def test_pick_cube(tmp_path: Path) -> None:
 
 def test_a_recurrent_player_keeps_its_memory_within_an_episode() -> None:
     """``predict`` of Dreamer without its state would judge every observation as the first of an episode."""
-    env = make_env("CPMToy-v0", keys=("state",))
+    env = gym.make("CPMToy-v0", keys=("state",))
     model = Dreamer("MultiInputPolicy", env, preset={"deter_size": 16, "hidden_size": 16}, learning_starts=50, seed=0)
     model.learn(60)
-    with_memory = play_episode(model, env, seed=7)
+    with_memory = evaluate(model, DummyVecEnv([lambda: Monitor(gym.make("CPMToy-v0", keys=("state",)))]), 1, 7)[0]
     expected, _ = evaluate_policy(model, SeededReset(env, 7), n_eval_episodes=1, warn=False)
     assert with_memory.episode_return == pytest.approx(expected, rel=1e-5)
     memoryless = [model.predict(env.reset(seed=7)[0], deterministic=True)[0]]
@@ -356,9 +345,9 @@ class SeededReset(gym.Wrapper):
 
 
 def test_csv_table_is_complete_after_every_row(tmp_path: Path) -> None:
-    table = CSVTable(tmp_path / "t.csv")
-    table.add({"a": 1, "b": None})
-    table.add({"a": 2.5, "b": 1 / 3})
+    table = GrownTable(tmp_path / "t.csv")
+    table.add_row({"a": 1, "b": None})
+    table.add_row({"b": 1 / 3, "a": 2.5})
     found = read_csv(tmp_path / "t.csv")  # before it is closed
     assert list(found["a"]) == [1, 2.5]
     assert np.isnan(found["b"][0]) and found["b"][1] == pytest.approx(1 / 3, rel=1e-5)

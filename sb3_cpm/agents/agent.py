@@ -107,6 +107,13 @@ class Agent:
                 model = algorithm(env=env, seed=seed, device=device, **hyperparameters)
             else:
                 model = algorithm.load(load_path, env=env, device=device)
+        except AssertionError as error:  # that is how SB3 says it
+            env.close()
+            if "action spaces" not in str(error):
+                raise
+            raise ValueError(
+                f"{self.env_id} has the action space {env.action_space}: {error}. Choose another agent."
+            ) from error
         except BaseException:
             env.close()
             raise

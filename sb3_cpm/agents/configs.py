@@ -4,6 +4,7 @@ import copy
 import difflib
 import warnings
 from collections.abc import Iterable, Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import gymnasium as gym
 
 from sb3_cpm.agents.tasks import ENV_IDS, NAMESPACE
 from sb3_cpm.arguments import nearest
-from sb3_cpm.extras import needed
+from sb3_cpm.extras import checkout, install_command, needed
 
 with needed("Configurations", "zoo"):
     import yaml
@@ -19,14 +20,19 @@ with needed("Configurations", "zoo"):
 
 def config_folder() -> Path:
     """
-    :return: ``zoo_configs/`` of the checkout that this package is in, or else of the working directory
+    A wheel brings the files as package ``sb3_cpm.zoo_configs``. A checkout has them beside the package, and they are read from
+    there: where another checkout is installed and ``PYTHONPATH`` names this one, an import would find those of the other.
+
+    :return: ``zoo_configs/``
     :raises ValueError: where there is none
     """
-    candidates = [Path(__file__).resolve().parents[2] / "zoo_configs", Path.cwd() / "zoo_configs"]
-    for folder in candidates:
-        if folder.is_dir():
-            return folder
-    raise ValueError(f"No folder zoo_configs, neither in {candidates[0].parent} nor here: give the path of a file.")
+    root = checkout()
+    if root is not None:
+        return root / "zoo_configs"
+    try:
+        return Path(str(resources.files("sb3_cpm.zoo_configs")))
+    except ModuleNotFoundError as error:
+        raise ValueError(f"sb3_cpm came without its zoo_configs: give the path of a file, or {install_command()}.") from error
 
 
 def find_config(name_or_path: str | Path) -> Path:
@@ -39,12 +45,16 @@ def find_config(name_or_path: str | Path) -> Path:
     if given.suffix in (".yml", ".yaml"):
         if given.is_file():
             return given
-        raise ValueError(f"There is no file {given}.")
+        raise ValueError(f"There is no file {given}. {_where()}")
     folder = config_folder()
     names = sorted(path.stem for path in folder.glob("*.yml"))
     if str(name_or_path) not in names:
         raise ValueError(f"Unknown agent {str(name_or_path)!r}.{nearest(str(name_or_path), names)} Known: {', '.join(names)}.")
     return folder / f"{name_or_path}.yml"
+
+
+def _where() -> str:
+    return f"The files of our agents are in {config_folder()}."
 
 
 def read_entries(path: Path) -> dict[str, Any]:
@@ -75,7 +85,7 @@ def check_environment_names(config: str, env_id: str) -> None:
     if path.suffix not in (".yml", ".yaml"):
         return
     if not path.is_file():
-        raise ValueError(f"There is no file {path}: name one with --conf-file.")
+        raise ValueError(f"There is no file {path}: name one with --conf-file. {_where()}")
     find_entry(read_entries(path), env_id, path)
 
 

@@ -21,6 +21,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.arguments import error_prefix
+from sb3_cpm.extras import needed
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +59,8 @@ def read_demonstrations(
     :raises ValueError: if that cannot be done, and how it could
     """
     path = Path(path)
-    h5py = _h5py()
+    with needed("ManiSkill's trajectory files", "demonstrations"):
+        import h5py
     if isinstance(env, VecEnv):
         raise ValueError(
             "Actions are replayed in a single environment: `env` is a VecEnv. Pass one as gymnasium.make() or "
@@ -101,16 +103,6 @@ def read_demonstrations(
     if not episodes:
         raise ValueError(f"{path}: no episode could be used. Is the environment the one that they were recorded in?")
     return episodes
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ValueError(
-            "Reading ManiSkill's trajectory files needs h5py: pip install h5py (it comes with mani_skill)"
-        ) from error
-    return h5py
 
 
 def _read_index(path: Path) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from sb3_cpm.extras import needed
+
 #: Bootstrap samples. rliable's example has 50000; 2000 are exact to a percent or two of the width.
 REPETITIONS = 2000
 
@@ -50,13 +52,10 @@ def estimate(scores: pd.DataFrame, repetitions: int = REPETITIONS) -> Estimate:
     :param scores: a row per step, a column per seed
     :param repetitions: bootstrap samples
     :return: interquartile means and their intervals; the same for the same scores
-    :raises RuntimeError: if rliable is missing
+    :raises MissingExtra: if rliable is missing
     """
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):
-            from rliable import library
-    except ImportError as error:
-        raise RuntimeError('Intervals need a package that is missing: pip install "sb3_cpm[experiments]"') from error
+    with needed("Intervals", "experiments"), contextlib.redirect_stderr(io.StringIO()):
+        from rliable import library
     runs = scores.to_numpy().T[:, None, :]  # (seeds, one task, steps)
 
     if not len(scores) or len(runs) == 1:  # nothing to draw from

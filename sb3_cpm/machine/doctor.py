@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from sb3_cpm.extras import install_command
 from sb3_cpm.machine.memory import memory_gib
 
 PYTHONS = ((3, 10), (3, 12))
@@ -66,11 +67,11 @@ def run_doctor() -> int:
 def examine() -> Iterator[Finding]:
     """:return: the findings, one by one, since the last ones take some seconds"""
     yield _python()
-    yield from (_package(name, f"pip install '{name}'") for name in REQUIRED)
+    yield from (_package(name, install_command()) for name in REQUIRED)
     th = _torch()
     yield th
-    yield from (_package(name, "pip install 'sb3_cpm[run,contrib]'") for name in OPTIONAL)
-    yield from (_package(name, "pip install 'sb3_cpm[maniskill]'") for name in SIMULATION)
+    yield from (_package(name, install_command("run", "contrib")) for name in OPTIONAL)
+    yield from (_package(name, install_command("maniskill")) for name in SIMULATION)
     yield _memory()
     yield _disk()
     yield _video()
@@ -122,7 +123,7 @@ def _video() -> Finding:
 
             path = imageio_ffmpeg.get_ffmpeg_exe()
         except (ImportError, RuntimeError):
-            return Finding("ffmpeg (videos)", False, "not found", "pip install imageio-ffmpeg, or install ffmpeg")
+            return Finding("ffmpeg (videos)", False, "not found", f"{install_command('run')}, or install ffmpeg")
     return Finding("ffmpeg (videos)", True, str(path))
 
 
@@ -131,7 +132,7 @@ def _rendering(torch_works: bool) -> Iterator[Finding]:
         yield Finding("SAPIEN renders", False, "not tried without torch", "see torch")
         return
     if not all(_package(name, "").well for name in ("mani_skill", "sapien")):
-        yield Finding("SAPIEN renders", False, "not tried without ManiSkill", "pip install 'sb3_cpm[maniskill]'")
+        yield Finding("SAPIEN renders", False, "not tried without ManiSkill", install_command("maniskill"))
         return
     from sb3_cpm.machine import rendering, vulkan
 

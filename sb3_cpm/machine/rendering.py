@@ -26,7 +26,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_cpm.extras import check_installed
+from sb3_cpm.extras import check_installed, install_command
 from sb3_cpm.machine import vulkan, vulkan_install
 from sb3_cpm.machine.thread_affinity import renderer_threads
 
@@ -360,7 +360,7 @@ def setup_rendering(private: bool = False, system: bool = False) -> int:
             return _report(probe)
         print(f"  {probe.problem}")
     if importlib.util.find_spec("sapien") is None:
-        print("Rendering: FAILED. SAPIEN is not installed. Cure: pip install 'sb3_cpm[maniskill]'")
+        print(f"Rendering: FAILED. SAPIEN is not installed. Cure: {install_command('maniskill')}")
         return 1
     if vulkan.named_drivers():
         print(f"Rendering: FAILED. Cure: {cure()}.")

@@ -105,9 +105,9 @@ class Watcher(BaseCallback):
             log_interval=None,  # type: ignore[arg-type]
             reset_num_timesteps=False,
         )
-        self._dump()
         if spec.eval_every:
             self._evaluate()
+        self._dump()
 
     def close(self) -> None:
         """:raises NotWrittenError: if rows of a table are still missing on the disk"""
@@ -128,12 +128,12 @@ class Watcher(BaseCallback):
         spec, now = self.spec, self.num_timesteps
         evaluation_due = bool(spec.eval_every) and self._next_evaluation <= now < spec.steps
         checkpoint_due = evaluation_due if spec.checkpoint_every is None else self._next_checkpoint <= now < spec.steps
-        # before a checkpoint, too: what the logger has gathered is not part of it
-        if now >= self._next_dump or evaluation_due or checkpoint_due:
-            self._dump()
         if evaluation_due:
             self._evaluate()
             self._next_evaluation += spec.eval_every
+        # before a checkpoint, too: what the logger has gathered is not part of it
+        if now >= self._next_dump or evaluation_due or checkpoint_due:
+            self._dump()
         if checkpoint_due:
             if spec.checkpoint_every is not None:
                 self._next_checkpoint = (now // spec.checkpoint_every + 1) * spec.checkpoint_every
@@ -169,6 +169,8 @@ class Watcher(BaseCallback):
         log_player_losses(self.model)
         if self.num_timesteps:
             self.model.dump_logs()
+        else:
+            self.logger.dump(0)  # of the first evaluation
 
     def _start_afresh(self) -> None:
         checkpoints.fresh_start(self.model, self.spec.seed, self.built.callbacks)
@@ -178,6 +180,10 @@ class Watcher(BaseCallback):
         spec, step = self.spec, self.built.model.num_timesteps
         with self.stopwatch.section("evaluation"):
             outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes, spec.eval_seed)
+        self.logger.record("eval/mean_reward", float(np.mean([outcome.episode_return for outcome in outcomes])))
+        told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
+        if told:
+            self.logger.record("eval/success_rate", float(np.mean(told)))
         for index, outcome in enumerate(outcomes):
             self.tables["evaluations"].add((spec.experiment, spec.agent, spec.env, spec.seed, step, index, *outcome))
         self.tell(self._news(step, outcomes))

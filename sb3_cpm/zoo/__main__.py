@@ -15,6 +15,8 @@ import sys
 import traceback
 from collections.abc import Sequence
 
+from sb3_cpm.extras import needed
+
 #: Commands, and the module and function where rl_zoo3 has them; a module without a function is a script.
 COMMANDS = {
     "train": "rl_zoo3.train:train",
@@ -39,14 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         usage = f"usage: python -m sb3_cpm.zoo COMMAND ..., one of: {', '.join(COMMANDS)}\n"
         (sys.stdout if wants_help else sys.stderr).write(usage)
         return 0 if wants_help else 2
-    try:
-        import rl_zoo3  # noqa: F401
-    except ImportError as error:
-        sys.stderr.write(f'error: rl_zoo3 is missing ({error}): pip install "sb3_cpm[zoo]"\n')
-        return 1
     from sb3_cpm.envs.suites import register_suite
 
     try:
+        with needed("rl_zoo3's commands", "zoo"):
+            import rl_zoo3  # noqa: F401
+
         rest = complete(command, rest)
         sys.argv = [f"{sys.argv[0]} {command}", *rest]
         register_suite(_option("--env", rest))

@@ -1,6 +1,6 @@
 """
 SAC with pink noise (Eberhard et al. 2023), a strong opponent in one line of a configuration: ``policy:
-sb3_cpm.zoo.pink_noise.PinkNoisePolicy``. Needs ``pink-noise-rl``.
+sb3_cpm.zoo.pink_noise.PinkNoisePolicy``.
 """
 
 from typing import Any
@@ -10,6 +10,8 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
+from sb3_cpm.extras import check_installed
+
 
 class PinkNoiseActor(Actor):
     """
@@ -17,9 +19,11 @@ class PinkNoiseActor(Actor):
     those that the actor learns from, are as ever: pink-noise-rl's own distribution would give a whole batch one sample.
 
     :param noise_length: steps that a noise signal lasts, the length of an episode
+    :raises MissingExtra: if pink-noise-rl is missing
     """
 
     def __init__(self, *args: Any, noise_length: int = 1000, **kwargs: Any) -> None:
+        check_installed("Policies with pink noise", ("pink",), "experiments")
         super().__init__(*args, **kwargs)
         self.noise_length = noise_length
         self._noises: list[Any] = []  # one for each environment

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from sb3_cpm.envs.maniskill.meshes import light_shapes
+from sb3_cpm.extras import install_command
 
 VISUALS = ("auto", "light", "full")
 
@@ -74,9 +75,9 @@ def choose_visuals(visuals: str, software: bool) -> Visuals:
         return Visuals()
     missing = [package for package in PACKAGES if importlib.util.find_spec(package) is None]
     if missing and visuals == "light":
-        raise RuntimeError(f"visuals='light' needs {missing[0]}: pip install trimesh fast-simplification")
+        raise RuntimeError(f"visuals='light' needs {missing[0]}: {install_command('maniskill')}")
     if missing:
-        warnings.warn(f"Slow rendering, {missing[0]} is missing: pip install trimesh fast-simplification", stacklevel=2)
+        warnings.warn(f"Slow rendering, {missing[0]} is missing: {install_command('maniskill')}", stacklevel=2)
     return Visuals(light=True, meshes=not missing)
 
 
