@@ -3,15 +3,15 @@ How much of an environment is seen without any reward: share of the cells of a s
 
 ::
 
-    python benchmarks/coverage.py run --agent random pink plan2explore rnd --env mountaincar maze_medium --seed 0 1 2 3 4
-    python benchmarks/coverage.py run --agent plan2explore --env maze_medium --seed 100 101 --preset '{horizon: 15}' --name h15
+    python benchmarks/coverage.py run --env mountaincar maze_medium --seed 10 11 12 13 14 15 16 17 18 19
+    python benchmarks/coverage.py run --agent challenger --env maze_medium --seed 100 101 --preset '{horizon: 15}' --name h15
     python benchmarks/coverage.py plot
 
 The cells are position x velocity on MountainCarContinuous-v0, positions in the free part of the two mazes, where every episode
 begins in the same corner, and positions of the puck on CPMToy-v0, which is seen by a camera and has to be pushed. All agents
 have the same episodes (of the same length, without an early end) and the same first random steps, and never see a reward.
-``plan2explore`` and ``rnd`` are :class:`~sb3_cpm.dreamer.Plan2Explore` with the uncertainty class of that name, alike in all
-else; ``pink`` is pink noise (pink-noise-rl). Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is complete;
+``challenger`` explores as that of ``ChallengerCallback()`` does: its default preset, an update every 8 steps.
+``plan2explore`` and ``rnd`` are the same with the uncertainty class of that name; ``pink`` is pink noise (pink-noise-rl). Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is complete;
 complete runs are skipped. ``plot`` draws ``results/coverage/coverage.png`` and writes ``results/coverage/summary.csv``, means
 over seeds with 95% confidence intervals. With ``--preset`` (entries as YAML) and ``--name`` an agent of another preset is
 tried, whose results lie in ``results/coverage-trials/NAME``.
@@ -32,11 +32,18 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_cpm.dreamer import Plan2Explore
 from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.presets import DEFAULT
 
 FOLDER = Path(__file__).parents[1] / "results" / "coverage"
 TRIALS = FOLDER.with_name("coverage-trials")
-NAMES = {"plan2explore": "Plan2Explore", "rnd": "RND", "pink": "pink noise", "random": "random actions"}
-LEARNING_STARTS, TRAIN_FREQ = 500, 10
+NAMES = {
+    "challenger": "the challenger",
+    "plan2explore": "Plan2Explore",
+    "rnd": "RND",
+    "pink": "pink noise",
+    "random": "random actions",
+}
+LEARNING_STARTS, TRAIN_FREQ = 500, 8
 RECORD_EVERY = 250
 
 
@@ -121,7 +128,7 @@ def explore(model_env: VecEnv, agent: str, task: Task, seed: int, preset: dict[s
     model = Plan2Explore(
         policy, model_env, seed=seed, device="cpu", preset=preset,
         learning_starts=task.steps if agent == "random" else LEARNING_STARTS, train_freq=train_freq,
-        uncertainty_class="rnd" if agent == "rnd" else "plan2explore",
+        uncertainty_class=agent if agent in ("rnd", "plan2explore") else DEFAULT.uncertainty_class,
     )  # fmt: skip
     model.learn(task.steps, log_interval=None)
 

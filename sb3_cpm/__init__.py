@@ -26,17 +26,28 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_cpm.buffers import CPMBuffer
     from sb3_cpm.callbacks import ChallengerCallback
+    from sb3_cpm.checkpoint_callback import CheckpointCPMCallback, resume
     from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
-__all__ = ["CPMBuffer", "ChallengerCallback", "PointNetExtractor", "PointNetPolicy", "__version__"]
+__all__ = [
+    "CPMBuffer",
+    "ChallengerCallback",
+    "CheckpointCPMCallback",
+    "PointNetExtractor",
+    "PointNetPolicy",
+    "__version__",
+    "resume",
+]
 
 _HOMES = {
     "CPMBuffer": "sb3_cpm.buffers",
     "ChallengerCallback": "sb3_cpm.callbacks",
+    "CheckpointCPMCallback": "sb3_cpm.checkpoint_callback",
     "PointNetExtractor": "sb3_cpm.extractors",
     "PointNetPolicy": "sb3_cpm.extractors",
+    "resume": "sb3_cpm.checkpoint_callback",
 }
 
 

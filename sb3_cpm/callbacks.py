@@ -5,30 +5,24 @@ Everything goes through SB3's own seams: a callback, a replay buffer class, and 
 environment, through which ``learn()`` takes its steps.
 """
 
-import signal
-import threading
 import warnings
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
-from sb3_cpm.exploration import ExplorationUnit, ExplorationVecEnv, make_decay
+from sb3_cpm.exploration import Decay, ExplorationUnit, ExplorationVecEnv, make_decay, without_exploration
+from sb3_cpm.player import check_learning_starts, check_model, original_space, player_keys
 from sb3_cpm.presets import ENTRIES, make_preset
 from sb3_cpm.stopwatch import Stopwatch
 from sb3_cpm.type_aliases import Evaluation
@@ -136,13 +130,13 @@ class ChallengerCallback(BaseCallback):
         self.proposals: list[tuple[Episode, Proposal]] = []
         self.stopwatch = Stopwatch()
         self._env: ExplorationVecEnv | None = None
-        self._previous_sigint: Any = None
         self._learn_started = 0.0
         self._next_training = 0
-        self._told_of_decay = False
+        self._goes_on = False  # with the moment of the next training that load_state_dict() has set
+        self._to_load: Mapping[str, Any] | None = None  # once there is a challenger
         self._n_short = 0
-        self._told_of_short = False
-        self._told_unread = False
+        #: What was warned of once already.
+        self._told: set[str] = set()
 
     # ------------------------------------------------------------------ public
 
@@ -166,6 +160,50 @@ class ChallengerCallback(BaseCallback):
             return float("nan")
         return self._env.n_explored / self._env.n_actions
 
+    @property
+    def exploration_env(self) -> ExplorationVecEnv | None:
+        """The wrapper through which the player takes its steps in this ``learn()``; None before the first."""
+        return self._env
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What it was made with: ``ChallengerCallback(**callback.arguments)`` is one like it, with a new challenger."""
+        names = (
+            *("preset", "keys", "uncertainty_class", "uncertainty_kwargs", "challenger_kwargs", "decay_steps", "unit"),
+            *("segment_length", "train_freq", "gradient_steps", "load_path", "device", "verbose"),
+        )
+        decay = self.decay.arguments if isinstance(self.decay, Decay) else {"decay": self.decay}
+        return {**{name: getattr(self, name) for name in names}, **decay}
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        What :meth:`load_state_dict` needs to go on exactly here, but for torch's random state.
+
+        :return: ``"challenger"``: networks, optimizers and scales, tensors that are not copied (None before there is one);
+            ``"progress"``: plain data
+        """
+        return {
+            "challenger": None if self.challenger is None else self.challenger.state_dict(include_rng=False),
+            "progress": {"next_training": self._next_training, "n_short": self._n_short, "told": sorted(self._told)},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """
+        Go on where another callback with the same arguments was: the next ``learn()`` trains the challenger when that one
+        would have.
+
+        :param state: of :meth:`state_dict`. Without a challenger in it, this callback's stays as it is; where this callback
+            has none yet, the first ``learn()`` gives it that of the state
+        :raises ValueError: if it belongs to a challenger of other sizes, naming the first mismatch; nothing is changed then
+        """
+        if self.challenger is None:
+            self._to_load = state
+        elif state["challenger"] is not None:
+            self.challenger.load_state_dict(state["challenger"])
+        progress = state["progress"]
+        self._next_training, self._n_short, self._told = progress["next_training"], progress["n_short"], set(progress["told"])
+        self._goes_on = True
+
     def save(self, path: str | Path) -> None:
         """
         Save the challenger, with optimizers and scales, for ``ChallengerCallback(load_path=...)``.
@@ -187,21 +225,21 @@ class ChallengerCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         model = self.model
-        _check_model(model)
-        _check_learning_starts(model)  # type: ignore[arg-type]
+        check_model(model)
+        check_learning_starts(model)  # type: ignore[arg-type]
         if self.challenger is None:
             self.challenger = self._make_challenger()
-        elif (self.challenger.observation_space, self.challenger.action_space) != (_original_space(model), model.action_space):
+        elif (self.challenger.observation_space, self.challenger.action_space) != (original_space(model), model.action_space):
             raise ValueError(
                 "This callback's challenger belongs to other spaces than the model's: it has "
                 f"{self.challenger.observation_space} and {self.challenger.action_space}, the model "
-                f"{_original_space(model)} and {model.action_space}. Make a new ChallengerCallback."
+                f"{original_space(model)} and {model.action_space}. Make a new ChallengerCallback."
             )
 
     def _make_challenger(self) -> Challenger:
         assert isinstance(self.model.action_space, spaces.Box)
         challenger = Challenger(
-            _original_space(self.model),
+            original_space(self.model),
             self.model.action_space,
             device=self.model.device if self.device == "auto" else self.device,
             preset=self.preset,
@@ -212,6 +250,9 @@ class ChallengerCallback(BaseCallback):
         )
         if self.load_path is not None:
             challenger.load_state(self.load_path)
+        if self._to_load is not None and self._to_load["challenger"] is not None:
+            challenger.load_state_dict(self._to_load["challenger"])
+        self._to_load = None
         return challenger
 
     def _on_training_start(self) -> None:
@@ -222,9 +263,10 @@ class ChallengerCallback(BaseCallback):
         if taken:
             raise ValueError("There are two ChallengerCallbacks in this learn(): a player has one challenger. Leave one out.")
         self._warn_of_restarted_decay()
+        self._warn_of_strange_challenges()
         env, buffer = without_exploration(model.env), self.buffer
         if buffer.player_keys is None:
-            buffer.player_keys = _player_keys(model)
+            buffer.player_keys = player_keys(model)
         self._warn_of_unread_keys(buffer.player_keys)
         for d in (buffer, buffer.demonstrations):  # model.set_env() does not tell them, and HER computes rewards in theirs
             if d is not None:
@@ -256,18 +298,18 @@ class ChallengerCallback(BaseCallback):
                 "replay_buffer_kwargs=dict(challenge_ratio=0).",
                 stacklevel=2,
             )
-        # what came before learning_starts, and what an earlier learn() left, is no backlog
-        self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
-        self._listen_for_ctrl_c()
+        if not self._goes_on:  # what came before learning_starts, and what an earlier learn() left, is no backlog
+            self._next_training = max(model.num_timesteps + self.train_freq, model.learning_starts + 1)
+        self._goes_on = False
 
     def _warn_of_restarted_decay(self) -> None:
         """Training in portions: a decay over ``learn()`` is over after the first, and C hardly ever acts from then on."""
-        if self.decay_steps is not None or self.model._num_timesteps_at_start == 0 or self._told_of_decay:
+        if self.decay_steps is not None or self.model._num_timesteps_at_start == 0 or "decay" in self._told:
             return
         before = self.epsilon  # until the first step the progress is that at the end of the last learn(), also after loading
         at_start = float(self.decay(1.0 - self.model.num_timesteps / self.model._total_timesteps))
         if at_start > before + 0.02:  # a little more of a long run is no new beginning
-            self._told_of_decay = True
+            self._told.add("decay")
             warnings.warn(
                 f"The exploration probability had fallen to {before:.3g} and begins again at {at_start:.3g}: "
                 "its decay runs within each learn(). ChallengerCallback(decay_steps=...), the number of steps of all portions "
@@ -275,14 +317,27 @@ class ChallengerCallback(BaseCallback):
                 stacklevel=2,
             )
 
+    def _warn_of_strange_challenges(self) -> None:
+        """What an earlier challenger found new says nothing of what this one does."""
+        assert self.challenger is not None
+        if self.challenger.trained_updates or not self.buffer.counters.proposed:
+            return
+        warnings.warn(
+            f"The replay buffer holds {len(self.buffer.challenges)} challenges, coefficients and tolerances of an earlier "
+            "challenger, and this callback's is new: they do not fit what it finds new. Give learn() the callback that filled "
+            "the buffer, or its challenger: ChallengerCallback(load_path=...) reads what callback.save(path) wrote. "
+            "CheckpointCPMCallback and resume() keep them together.",
+            stacklevel=2,
+        )
+
     def _warn_of_unread_keys(self, player_keys: Sequence[str] | None) -> None:
         """
         Of a Dict that P and C share, each leaves out what the other may read. What neither does is lost; and what P reads but
         C cannot plays no role for what is new.
         """
-        if self.keys is not None or self._told_unread:  # the user has chosen, or knows
+        if self.keys is not None or "unread" in self._told:  # the user has chosen, or knows
             return
-        self._told_unread = True
+        self._told.add("unread")
         assert self.challenger is not None
         images_only = not self.challenger.preset.read_vectors  # then vectors are left out on purpose
         for key, space in unread(self.challenger.observation_space, self.challenger.keys).items():
@@ -354,8 +409,8 @@ class ChallengerCallback(BaseCallback):
         first = self.buffer.curator.warmup_steps
         for episode in episodes:  # F5: the first transition that counts is no goal
             self._n_short = self._n_short + 1 if episode.length < first + 2 else 0
-            if self._n_short == MANY_SHORT and not self._told_of_short and self.buffer.challenge_ratio:
-                self._told_of_short = True
+            if self._n_short == MANY_SHORT and "short" not in self._told and self.buffer.challenge_ratio:
+                self._told.add("short")
                 warnings.warn(
                     f"{MANY_SHORT} episodes in a row had fewer than {first + 2} steps. They give no challenges: the first "
                     f"warmup_steps={first} never count, and a goal comes after at least one that does. Give "
@@ -453,50 +508,10 @@ class ChallengerCallback(BaseCallback):
         buffer = self.model.replay_buffer  # type: ignore[attr-defined]
         if isinstance(buffer, CPMBuffer):
             buffer.detach_challenger()
-        if self._previous_sigint is not None:
-            signal.signal(signal.SIGINT, self._previous_sigint)
-            self._previous_sigint = None
-
-    def _listen_for_ctrl_c(self) -> None:
-        """Ctrl-C can come while P trains, where no hook of ours would see the exception."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        previous = signal.getsignal(signal.SIGINT)
-        while isinstance(previous, _CtrlC) and previous.callback() in (None, self):  # left behind by a learn() that failed
-            previous = previous.previous
-        if callable(previous):
-            signal.signal(signal.SIGINT, _CtrlC(self, previous))
-            self._previous_sigint = previous
 
     def __getstate__(self) -> dict[str, Any]:
         """A callback is not part of a saved model, but checkpointing tools may pickle what refers to it."""
-        state = self.__dict__.copy()
-        state.update(_env=None, _previous_sigint=None)
-        return state
-
-
-class _CtrlC:
-    """
-    Takes the wrapper off where Ctrl-C ends a run. An exception that reaches no hook of ours leaves it behind, so it does not
-    keep the callback alive, nor by that the model and its replay buffer.
-
-    :param callback: to detach
-    :param previous: the handler that was there before
-    """
-
-    def __init__(self, callback: ChallengerCallback, previous: Callable[[int, FrameType | None], Any]):
-        self.callback = weakref.ref(callback)
-        self.previous = previous
-
-    def __call__(self, signum: int, frame: FrameType | None) -> None:
-        try:
-            self.previous(signum, frame)
-        except BaseException:
-            callback = self.callback()
-            if callback is not None:
-                callback._detach()
-            raise
-        # one that returns, a flag set, lets the run go on, and C with it
+        return {**self.__dict__, "_env": None}  # of a running learn()
 
 
 def _check_challenger_kwargs(given: Any) -> None:
@@ -504,122 +519,3 @@ def _check_challenger_kwargs(given: Any) -> None:
         if isinstance(given, Mapping) and name in given:
             raise ValueError(f"challenger_kwargs are entries of the preset: give {name!r} to ChallengerCallback itself.")
     check_names("challenger_kwargs", given, ENTRIES)
-
-
-def without_exploration(env: VecEnv | None) -> VecEnv:
-    """:return: the environment without any exploration wrapper around it, one that an exception left behind included"""
-    assert env is not None
-    while isinstance(env, ExplorationVecEnv):
-        env = env.venv
-    inner = env
-    while isinstance(inner, VecEnvWrapper):
-        if isinstance(inner.venv, ExplorationVecEnv):
-            inner.venv = inner.venv.venv
-        else:
-            inner = inner.venv
-    return env
-
-
-def _features_extractors(model: OffPolicyAlgorithm) -> list[th.nn.Module]:
-    modules = (getattr(model, name, None) for name in ("policy", "actor", "critic"))
-    extractors = (getattr(module, "features_extractor", None) for module in modules)
-    return [extractor for extractor in extractors if extractor is not None]
-
-
-def _player_keys(model: OffPolicyAlgorithm) -> tuple[str, ...] | None:
-    """Keys that P's features extractors read, where they tell; images that only C looks at need not be moved for P."""
-    keys = [getattr(extractor, "player_keys", None) for extractor in _features_extractors(model)]
-    if not keys or any(read is None for read in keys):
-        return None
-    wanted = set().union(*keys)  # type: ignore[arg-type]
-    return tuple(key for key in model.observation_space.spaces if key in wanted)  # type: ignore[attr-defined]
-
-
-def _check_model(model: Any) -> None:
-    """Everything that must hold before the first step is taken."""
-    name = type(model).__name__
-    if not isinstance(model, OffPolicyAlgorithm):
-        raise ValueError(
-            f"ChallengerCallback needs an off-policy algorithm with a CPMBuffer (SAC, TD3, DDPG, TQC), got {name}"
-        )
-    if not isinstance(model.observation_space, spaces.Dict):
-        raise ValueError(
-            f"ChallengerCallback needs a Dict observation space, got {model.observation_space}. Wrap the environment in "
-            f'sb3_cpm.envs.DictObservation(env) and use {name}("MultiInputPolicy", ...): SAC, TD3, DDPG, TQC and all of SBX '
-            "have such a policy, sb3-contrib's CrossQ has none."
-        )
-    if not isinstance(model.action_space, spaces.Box):
-        raise ValueError(f"ChallengerCallback needs continuous actions (a Box action space), got {model.action_space}")
-    if not isinstance(model.replay_buffer, CPMBuffer):
-        raise ValueError(
-            f"ChallengerCallback needs a CPMBuffer, but {name} has a {type(model.replay_buffer).__name__}: make it with "
-            f'{name}("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)'
-        )
-    given = model.replay_buffer.player_keys
-    if given is None:
-        return
-    for extractor in _features_extractors(model):
-        reads = extractor.extractors if isinstance(extractor, CombinedExtractor) else getattr(extractor, "player_keys", ())
-        missing = sorted(set(reads) - set(given))
-        if missing:
-            raise ValueError(
-                f"The buffer's player_keys {list(given)} lack {missing}, which the player's {type(extractor).__name__} "
-                "reads: add them, or leave `player_keys` out of replay_buffer_kwargs."
-            )
-
-
-def _original_space(model: BaseAlgorithm) -> spaces.Dict:
-    """
-    What the environment gives, which is what C reads: where VecNormalize also normalizes images, it declares them anew, in
-    SB3's own space (uint8 from 0 to 255 only; a CPMBuffer then stores them as float32).
-    """
-    space, env = model.observation_space, model.get_vec_normalize_env()
-    assert isinstance(space, spaces.Dict)
-    if env is None or not env.norm_obs:
-        return space
-    given: Any = env.get_original_obs()
-    images = {
-        key: spaces.Box(0, 255, space[key].shape, np.float32)
-        for key in env.norm_obs_keys or ()
-        if given[key].dtype == np.uint8 and space[key].dtype != np.uint8
-    }
-    return spaces.Dict({**space.spaces, **images}) if images else space
-
-
-def _check_learning_starts(model: OffPolicyAlgorithm) -> None:
-    """P can only sample once an episode has ended; say so now instead of in the middle of the run."""
-    assert model.env is not None and isinstance(model.replay_buffer, CPMBuffer)
-    longest = max_episode_steps(model.env)
-    if longest is None or model.replay_buffer.episodes_ended:
-        return
-    needed = longest * model.n_envs
-    if model.learning_starts - model.num_timesteps < needed:
-        if model.num_timesteps:
-            raise ValueError(
-                f"The model has made {model.num_timesteps} steps, but its replay buffer has no complete episode: that is in a "
-                "file of its own. Call model.load_replay_buffer(path) before learn(), with what "
-                "model.save_replay_buffer(path) saved; or begin with new experience: learning_starts="
-                f"{model.num_timesteps + needed} (it counts from the first step, and episodes last up to {longest} steps)."
-            )
-        raise ValueError(
-            f"learning_starts={model.learning_starts} ends before the first episode may: episodes last up to {longest} steps "
-            f"in each of {model.n_envs} environments. Set learning_starts={needed} or more."
-        )
-    if model.buffer_size < 2 * needed:
-        raise ValueError(
-            f"buffer_size={model.buffer_size} is too small: while an episode of up to {longest} steps is written in each of "
-            f"{model.n_envs} environments, a complete one must remain to learn from. Set buffer_size={2 * needed} or more."
-        )
-
-
-def max_episode_steps(env: VecEnv) -> int | None:
-    """:return: the time limit of the environments, None where there is none or none can be known"""
-    limits: list[int | None] = []
-    if not isinstance(env.unwrapped, SubprocVecEnv):  # not every spec can be pickled, and a worker that cannot send one dies
-        try:
-            limits = [spec.max_episode_steps for spec in env.get_attr("spec") if spec is not None]
-        except AttributeError:  # VecEnvs that are not made of gymnasium environments
-            return None
-    if not limits and env.has_attr("_max_episode_steps"):  # TimeLimit's, also around environments that are not registered
-        limits = env.get_attr("_max_episode_steps")
-    return max((limit for limit in limits if limit is not None), default=None)

@@ -1,29 +1,31 @@
 """
-Checkpoints from which a killed run goes on as if nothing had happened.
+Checkpoints: all that a run needs to go on, in one folder, which is whole or not there.
 
-SB3 restores neither random states nor environments. So a run makes a fresh start at every checkpoint, whether it was killed or
-not: all random generators are seeded from (seed, step), and the environments begin new episodes. What a resumed run does from
-there on is then the same as what an unbroken one does.
+SB3 restores neither random states nor environments. A run that is to go on as if nothing had happened makes a fresh start at
+every checkpoint, whether it was killed or not (:func:`fresh_start`): all random generators are seeded from (seed, step), and
+the environments begin new episodes. What a resumed run does from there on is then the same as what an unbroken one does.
 
 Of its files only ``model.zip``, which is SB3's own, can execute code when it is read; all others are arrays and JSON.
+:mod:`sb3_cpm.checkpoint_callback` is the same for people's own code.
 """
 
 import os
 import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cpm.buffers import EpisodeBuffer
@@ -39,21 +41,24 @@ from sb3_cpm.files import (
     write_sealed,
 )
 from sb3_cpm.packing import pack, unpack
+from sb3_cpm.randomness import random_state
 from sb3_cpm.seeds import FIRST_SEED
 
 NAME = "checkpoint"
 MODEL, BUFFER, STATE = "model.zip", "replay_buffer.npz", "state.npz"
+#: Of the state; files of before there were versions lack it.
+VERSION = 2
 
 #: Attributes of SB3's replay buffers that come from their arguments.
 _OF_ARGUMENTS = {"observation_space", "action_space", "obs_shape", "device", "env", "goal_selection_strategy"}
 
 
-def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra: dict[str, Any]) -> None:
+def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback], extra: dict[str, Any]) -> None:
     """
     Write a complete checkpoint, then let it take the place of the last one.
 
-    :param folder: of the run
-    :param model: with its replay buffer, where it has one
+    :param folder: of the run, which is there
+    :param model: with its replay buffer, where it has one; between two rollouts, so that the last one is in it
     :param callbacks: challengers among them are saved
     :param extra: plain data to be given back by :func:`load_extra`
     :raises NotWrittenError: if the disk does not take it; the last one stays
@@ -69,8 +74,8 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: list[BaseCall
         shutil.rmtree(new, ignore_errors=True)
         raise
     with disk_errors_named(current):
-        shutil.rmtree(old, ignore_errors=True)
-        if current.exists():
+        if current.exists():  # else a process was killed between these lines, and the last one is `old`
+            shutil.rmtree(old, ignore_errors=True)
             os.replace(current, old)
         os.replace(new, current)
     shutil.rmtree(old, ignore_errors=True)
@@ -90,10 +95,12 @@ def save_model(path: Path, model: BaseAlgorithm) -> None:
     write_sealed(path, model.save)
 
 
-def _write(new: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra: dict[str, Any]) -> None:
-    save_model(new / MODEL, model)
+def _write(new: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback], extra: dict[str, Any]) -> None:
     arrays: dict[str, np.ndarray] = {}
-    content: dict[str, Any] = {}
+    content: dict[str, Any] = {"version": VERSION, "extra": pack(extra, name="extra")}
+    content["random"] = pack(random_state(model.action_space))
+    save_model(new / MODEL, model)
+    content["model_class"] = _name_of_class(type(model))
     buffer = getattr(model, "replay_buffer", None)
     if isinstance(buffer, EpisodeBuffer):
         buffer.save(new / BUFFER)
@@ -102,13 +109,39 @@ def _write(new: Path, model: BaseAlgorithm, callbacks: list[BaseCallback], extra
     normalize = model.get_vec_normalize_env()
     if normalize is not None:
         content["normalization"] = pack({name: _numbers(one) for name, one in _statistics(normalize).items()})
-    next_training = {}
-    for index, callback in enumerate(callbacks):
-        if isinstance(callback, ChallengerCallback) and callback.challenger is not None:
-            callback.save(new / f"challenger{index}.pt")
-            next_training[index] = callback._next_training
-    content["extra"] = pack({"next_training": next_training, **extra})
-    write_archive(new / STATE, content, arrays)
+    content["challengers"] = {}
+    for index, callback in _challengers(callbacks):
+        callback.save(new / _challenger_file(index))
+        storable, rest = _storable(callback.arguments)
+        progress = callback.state_dict()["progress"]
+        content["challengers"][str(index)] = {"arguments": storable, "not stored": rest, "progress": pack(progress)}
+    content["files"] = [STATE, *(path.name for path in sorted(new.iterdir()))]
+    write_archive(new / STATE, content, arrays)  # the last one: where it is, all are
+
+
+def _challengers(callbacks: Sequence[BaseCallback]) -> list[tuple[int, ChallengerCallback]]:
+    """Those that have a challenger yet, with their index."""
+    found = [(index, one) for index, one in enumerate(callbacks) if isinstance(one, ChallengerCallback)]
+    return [(index, one) for index, one in found if one.challenger is not None]
+
+
+def _challenger_file(index: int) -> str:
+    return f"challenger{index}.pt"
+
+
+def _storable(arguments: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """:return: the arguments of a callback that are plain data, packed, and the names of the others"""
+    packed, rest = {}, []
+    for name, value in arguments.items():
+        try:
+            packed[name] = pack(str(value) if isinstance(value, (Path, th.device)) else value)
+        except ValueError:  # a function, a class
+            rest.append(name)
+    return packed, rest
+
+
+def _name_of_class(kind: type) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def find_checkpoint(folder: Path) -> Path | None:
@@ -120,10 +153,7 @@ def find_checkpoint(folder: Path) -> Path | None:
     for name in (NAME, f"{NAME}.old"):
         checkpoint = folder / name
         if (checkpoint / "state.pkl").exists():
-            raise DamagedRunError(
-                f"{checkpoint} was written by an earlier sb3_cpm, as pickles, which can execute anything when they are read: "
-                f"finish the run with that version, or remove {checkpoint} to begin it anew."
-            )
+            raise _earlier_version(checkpoint, ", as pickles, which can execute anything when they are read")
         if (checkpoint / STATE).exists():
             _check(checkpoint)
             return checkpoint
@@ -131,13 +161,27 @@ def find_checkpoint(folder: Path) -> Path | None:
 
 
 def _check(checkpoint: Path) -> None:
+    remove = f"Remove {checkpoint} to begin the run anew."
     try:
         for path in sorted(checkpoint.iterdir()):
             if not verify(path):
                 raise DamagedFileError(f"{path} has no digest: this package did not write it.")
+        with Archive(checkpoint / STATE, "checkpoint") as archive:
+            if archive.content.get("version") != VERSION:
+                raise _earlier_version(checkpoint)
+            missing = [name for name in archive.content["files"] if not (checkpoint / name).is_file()]
     except DamagedFileError as error:
         told = str(error).replace(" Take an earlier one.", "")  # there is none
-        raise DamagedRunError(f"{told} Remove {checkpoint} to begin the run anew.") from error
+        raise DamagedRunError(f"{told} {remove}") from error
+    if missing:
+        raise DamagedRunError(f"{checkpoint} is half a checkpoint: {', '.join(missing)} is gone. {remove}")
+
+
+def _earlier_version(checkpoint: Path, how: str = "") -> DamagedRunError:
+    return DamagedRunError(
+        f"{checkpoint} was written by an earlier sb3_cpm{how}: finish the run with that version, or remove {checkpoint} to "
+        "begin it anew."
+    )
 
 
 def remove_checkpoints(folder: Path) -> None:
@@ -147,11 +191,33 @@ def remove_checkpoints(folder: Path) -> None:
 
 def load_extra(checkpoint: Path) -> dict[str, Any]:
     """
-    :return: what was given to :func:`save_checkpoint`, and ``next_training`` of the challengers
+    :return: what was given to :func:`save_checkpoint`
     :raises ValueError: if the file is damaged
     """
     with Archive(checkpoint / STATE, "checkpoint") as archive:
         return unpack(archive.content["extra"])
+
+
+def restore(checkpoint: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback] = ()) -> None:
+    """
+    Give model and challengers back what they had. The episodes that went on then are over, and new ones begin.
+
+    :param checkpoint: of :func:`find_checkpoint`
+    :param model: loaded from ``model.zip`` of this checkpoint
+    :param callbacks: like those that were saved; challengers among them get their state back, before ``learn()``
+    :raises ValueError: if a challenger does not fit, or the environment is normalized otherwise
+    """
+    restore_buffer(checkpoint, model)
+    begin_episodes(model)
+    with Archive(checkpoint / STATE, "checkpoint") as archive:
+        saved = archive.content["challengers"]
+    for index, entry in saved.items():
+        callback = callbacks[int(index)]
+        assert isinstance(callback, ChallengerCallback)
+        callback.init_callback(model)
+        assert callback.challenger is not None
+        callback.challenger.load_state(checkpoint / _challenger_file(int(index)))
+        callback.load_state_dict({"challenger": None, "progress": unpack(entry["progress"])})
 
 
 def restore_buffer(checkpoint: Path, model: BaseAlgorithm) -> None:
@@ -231,30 +297,6 @@ def _name(attribute: str, key: str | None) -> str:
     return attribute if key is None else f"{attribute}/{quote(key, '')}"
 
 
-class ChallengerRestorer(BaseCallback):
-    """
-    Gives challengers their state back once ``learn()`` has made them; to be listed after them.
-
-    :param checkpoint: where it comes from
-    :param callbacks: of the run
-    """
-
-    def __init__(self, checkpoint: Path, callbacks: list[BaseCallback]) -> None:
-        super().__init__()
-        self.checkpoint, self.callbacks = checkpoint, callbacks
-        self.next_training: dict[int, int] = load_extra(checkpoint)["next_training"]
-
-    def _on_training_start(self) -> None:
-        for index, step in self.next_training.items():
-            callback = self.callbacks[index]
-            assert isinstance(callback, ChallengerCallback) and callback.challenger is not None
-            callback.challenger.load_state(self.checkpoint / f"challenger{index}.pt")
-            callback._next_training = step
-
-    def _on_step(self) -> bool:
-        return True
-
-
 def fresh_start(model: BaseAlgorithm, seed: int, callbacks: Sequence[BaseCallback] = ()) -> None:
     """
     Seed everything from (seed, number of steps so far) and begin new episodes.
@@ -263,13 +305,32 @@ def fresh_start(model: BaseAlgorithm, seed: int, callbacks: Sequence[BaseCallbac
     :param seed: of the run
     :param callbacks: of the run; what a challenger among them has put around the environments begins anew, too
     """
-    wrappers = [
-        callback._env for callback in callbacks if isinstance(callback, ChallengerCallback) and callback._env is not None
-    ]
-    env = wrappers[-1] if wrappers else model.env
+    wrappers = [one.exploration_env for _, one in _challengers(callbacks) if one.exploration_env is not None]
+    model.set_random_seed(seed_at(model.num_timesteps, seed, model.n_envs))
+    begin_episodes(model, wrappers[-1] if wrappers else None, counted=True)
+    if model.use_sde:  # SB3 has drawn the noise of the rollout that begins, before it told anybody
+        noisy = model.policy if isinstance(model, OnPolicyAlgorithm) else model.policy.actor
+        noisy.reset_noise(model.n_envs)  # type: ignore[operator, union-attr]
+
+
+def seed_at(step: int, seed: int, n_envs: int) -> int:
+    """:return: the seed of what comes after a checkpoint at this step, one of those that evaluation does not have"""
+    words = np.random.SeedSequence([seed, step]).generate_state(1)
+    return int(words[0]) % (FIRST_SEED - n_envs)
+
+
+def begin_episodes(model: BaseAlgorithm, env: VecEnv | None = None, counted: bool = False) -> None:
+    """
+    End the episodes that go on in the model's buffer, and begin new ones, from which the next ``learn(...,
+    reset_num_timesteps=False)`` goes on.
+
+    :param model: between two rollouts
+    :param env: the environments, as the rollouts see them; None: ``model.env``
+    :param counted: whether a VecNormalize counts the first observations, as it does with those of other episodes. It must not
+        where this is done once more, or already was
+    """
+    env = model.env if env is None else env
     assert env is not None
-    words = np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)
-    model.set_random_seed(int(words[0]) % (FIRST_SEED - model.n_envs))  # evaluation has the seeds from there on
     buffer = getattr(model, "replay_buffer", None)
     if isinstance(buffer, HerReplayBuffer):
         with warnings.catch_warnings():
@@ -278,11 +339,15 @@ def fresh_start(model: BaseAlgorithm, seed: int, callbacks: Sequence[BaseCallbac
     noise = getattr(model, "action_noise", None)
     if noise is not None:
         noise.reset()
-    model._last_obs = env.reset()  # type: ignore[assignment]
-    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
     normalize = model.get_vec_normalize_env()
+    counts = normalize is not None and normalize.training
+    if normalize is not None:
+        normalize.training = counts and counted
+    try:
+        model._last_obs = env.reset()  # type: ignore[assignment]
+    finally:
+        if normalize is not None:
+            normalize.training = counts
+    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
     if normalize is not None:
         model._last_original_obs = normalize.get_original_obs()
-    if model.use_sde:  # SB3 has drawn the noise of the rollout that begins, before it told anybody
-        noisy = model.policy if isinstance(model, OnPolicyAlgorithm) else model.policy.actor
-        noisy.reset_noise(model.n_envs)  # type: ignore[operator, union-attr]

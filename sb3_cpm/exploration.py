@@ -15,7 +15,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_cpm.arguments import ABOVE_0, SHARE, check, check_each, nearest
@@ -64,12 +64,12 @@ def make_decay(decay: str | Schedule = "exponential", start: float = 0.8, floor:
     check("rate", rate, ABOVE_0)
     if floor > start:
         raise ValueError(f"A decay needs 0 <= floor <= start <= 1, got start={start}, floor={floor}")
-    return _Decay(decay, start, floor, rate)
+    return Decay(decay, start, floor, rate)
 
 
 @dataclass(frozen=True)
-class _Decay:
-    """A decay by name; can be pickled, as SB3's callbacks can."""
+class Decay:
+    """A decay by name, see :func:`make_decay`; can be pickled, as SB3's callbacks can."""
 
     name: str
     start: float
@@ -78,6 +78,11 @@ class _Decay:
 
     def __call__(self, progress_remaining: float) -> float:
         return self.floor + (self.start - self.floor) * _DECAYS[self.name](1.0 - progress_remaining, self.rate)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Of the callback that has it."""
+        return {"decay": self.name, "decay_kwargs": {"start": self.start, "floor": self.floor, "rate": self.rate}}
 
 
 class _Row(NamedTuple):
@@ -301,3 +306,17 @@ class ExplorationVecEnv(WatchedVecEnv):
                             f"{self._n_steps} of this learn(). stable_baselines3.common.vec_env.VecCheckNan helps to find "
                             "where they come from."
                         )
+
+
+def without_exploration(env: VecEnv | None) -> VecEnv:
+    """:return: the environment without any exploration wrapper around it, one that an exception left behind included"""
+    assert env is not None
+    while isinstance(env, ExplorationVecEnv):
+        env = env.venv
+    inner = env
+    while isinstance(inner, VecEnvWrapper):
+        if isinstance(inner.venv, ExplorationVecEnv):
+            inner.venv = inner.venv.venv
+        else:
+            inner = inner.venv
+    return env

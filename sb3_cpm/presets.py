@@ -283,7 +283,7 @@ DEFAULT = replace(
         "plan2explore": {"heads": 5, "layers": 2, "units": 128, "target": "feat", "metric": "exp"},
         "rnd": {"layers": 3, "units": 128, "output_dim": 64},
         "prediction_error": {"layers": 2, "units": 128},
-        "observation_ensemble": {"heads": 5, "layers": 2, "units": 128, "dims": 64},
+        "observation_ensemble": {"heads": 5, "layers": 2, "units": 128, "dims": 128},
     },
 )
 

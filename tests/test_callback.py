@@ -22,10 +22,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvW
 
 from sb3_cpm import ChallengerCallback, CPMBuffer, PointNetPolicy
 from sb3_cpm.buffers import Demonstration
-from sb3_cpm.callbacks import without_exploration
 from sb3_cpm.envs.toy import ToyEnv
 from sb3_cpm.envs.wrappers import DictObservation
-from sb3_cpm.exploration import ExplorationVecEnv
+from sb3_cpm.exploration import ExplorationVecEnv, without_exploration
 
 TINY = dict(
     batch_size=4, sequence_length=12, cnn_depth=4, vector_units=16, stoch_size=4, deter_size=16, hidden_size=16, head_units=16,
@@ -238,6 +237,45 @@ def test_a_second_learn_goes_on_with_the_same_challenger():
         make_model(toy(("camera", "state")), policy=PointNetPolicy).learn(10, callback=callback)
 
 
+def test_a_used_buffer_that_meets_a_new_challenger():
+    model, callback = make_model(buffer_kwargs=LENIENT), make_callback(decay="constant")
+    model.learn(300, callback=callback)
+    assert model.replay_buffer.challenges
+    with pytest.warns(UserWarning, match=r"holds \d+ challenges, .* of an earlier challenger.*load_path=.*resume\(\) keep"):
+        model.learn(10, callback=make_callback(decay="constant"), reset_num_timesteps=False)
+    model.learn(10, callback=callback, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize("before_learn", [True, False])
+def test_the_state_of_a_callback(before_learn):
+    """C's next training comes when it would have come, with the same networks."""
+    model, callback = make_model(), make_callback(train_freq=70, decay="constant")
+    model.learn(330, callback=callback)
+    assert model.replay_buffer.episodes_ended and callback.challenger.trained_updates == 4  # at 101, 171, 241 and 311
+    state = pickle.loads(pickle.dumps(callback.state_dict()))
+    again = ChallengerCallback(**callback.arguments)
+    assert again.arguments == callback.arguments
+    if not before_learn:
+        again.init_callback(model)
+    again.load_state_dict(state)
+    model.learn(50, callback=again, reset_num_timesteps=False)
+    assert again.challenger.trained_updates == 4
+    ours, theirs = (one.challenger.world_model.state_dict() for one in (callback, again))
+    assert all(th.equal(ours[name], theirs[name]) for name in ours)
+    again.load_state_dict(state)
+    model.learn(1, callback=again, reset_num_timesteps=False)
+    assert again.challenger.trained_updates == 5, "at 381"
+
+
+def test_the_state_of_a_challenger_of_other_sizes():
+    model, callback = make_model(), make_callback()
+    model.learn(10, callback=callback)
+    other = make_callback(challenger_kwargs={**TINY, "hidden_size": 17})
+    other.init_callback(model)
+    with pytest.raises(ValueError, match="world_model"):
+        other.load_state_dict(callback.state_dict())
+
+
 def test_vecnormalize():
     env = VecNormalize(toy(), norm_obs_keys=["state"])
     model = make_model(env, buffer_kwargs=LENIENT)
@@ -381,20 +419,34 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
+class InterruptedSAC(SAC):
+    """Somebody presses Ctrl-C while P trains."""
+
+    def train(self, gradient_steps, batch_size):
+        if self.num_timesteps == 230:
+            os.kill(os.getpid(), signal.SIGINT)
+        super().train(gradient_steps, batch_size)
+
+
+@pytest.mark.parametrize("while_p_trains", [False, True])
 @pytest.mark.usefixtures("ctrl_c")
-def test_ctrl_c_takes_the_wrapper_off_and_loses_nothing(tmp_path):
-    model, callback = make_model(), make_callback()
-    before = signal.getsignal(signal.SIGINT)
+def test_ctrl_c_loses_nothing(while_p_trains, tmp_path):
+    model = make_model(model_class=InterruptedSAC if while_p_trains else SAC)
+    callback, env = make_callback(), model.env
+    press = RaisesAt(230, lambda: None if while_p_trains else os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
-        model.learn(400, callback=[callback, RaisesAt(230, lambda: os.kill(os.getpid(), signal.SIGINT))])
-    assert not isinstance(model.env, ExplorationVecEnv)
-    assert signal.getsignal(signal.SIGINT) is before
+        model.learn(400, callback=[callback, press])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert len(model.replay_buffer.episodes) == 4
+    explored = callback.exploration_env.n_explored
+    evaluate_policy(model, model.get_env(), 1)
+    assert callback.exploration_env.n_explored == explored, "C does not act where P is evaluated"
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     callback.save(tmp_path / "challenger.pt")
+    SAC.load(tmp_path / "model", env=model.get_env()).load_replay_buffer(tmp_path / "buffer", truncate_last_traj=False)
     model.learn(50, callback=callback, reset_num_timesteps=False)
-    assert isinstance(without_exploration(model.env), type(model.env))
+    assert model.env is env
 
 
 @pytest.mark.usefixtures("ctrl_c")
@@ -423,12 +475,12 @@ def test_an_exception_of_another_callback_leaves_nothing_behind():
     with pytest.raises(ZeroDivisionError):
         model.learn(400, callback=[callback, RaisesAt(130, lambda: 1 / 0)])
     assert model.env is env
-    explored, size = callback._env.n_explored, model.replay_buffer.size()
+    explored, size = callback.exploration_env.n_explored, model.replay_buffer.size()
     evaluate_policy(model, model.get_env(), 1)
     for reset in (True, False):  # SB3 tells no callback that its learn() is over
         with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
             model.learn(50, reset_num_timesteps=reset)
-    assert callback._env.n_explored == explored and model.replay_buffer.size() == size
+    assert callback.exploration_env.n_explored == explored and model.replay_buffer.size() == size
     model.learn(100, callback=callback, reset_num_timesteps=False)
     assert callback.explored_share == 1.0 and model.env is env
 
@@ -453,8 +505,7 @@ def test_player_keys_that_the_player_cannot_do_without():
 
 
 def test_an_exception_keeps_no_model_alive():
-    """SB3 tells no callback of it, so the handler of Ctrl-C stays: of that there may be many in a notebook."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test before this one may have left another
+    """SB3 tells no callback of it, and in a notebook there may be many."""
     buffers = []
     for _ in range(3):
         model = make_model()
@@ -464,8 +515,6 @@ def test_an_exception_keeps_no_model_alive():
         del model
     gc.collect()
     assert [buffer() for buffer in buffers] == [None] * 3
-    make_model().learn(10, callback=make_callback())
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_an_exception_while_p_trains_leaves_nothing_that_acts():
@@ -474,11 +523,11 @@ def test_an_exception_while_p_trains_leaves_nothing_that_acts():
     with pytest.raises(TypeError):
         model.learn(400, callback=callback)
     model.batch_size = batch_size
-    explored = callback._env.n_explored
+    explored = callback.exploration_env.n_explored
     evaluate_policy(model, model.get_env(), 1)
     with pytest.raises(ValueError, match=r"callback=ChallengerCallback\(\)"):
         model.learn(50)
-    assert callback._env.n_explored == explored
+    assert callback.exploration_env.n_explored == explored
 
 
 def test_an_environment_that_dies_takes_the_wrapper_off():

@@ -16,9 +16,9 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_cpm.callbacks import max_episode_steps
 from sb3_cpm.envs import ManiSkillEnv, make_maniskill_env
 from sb3_cpm.envs.maniskill.observations import to_host
+from sb3_cpm.player import max_episode_steps
 
 CAMERAS = ("base_camera", "hand_camera")
 

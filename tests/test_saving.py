@@ -292,7 +292,7 @@ def test_a_checkpoint_holds_sb3s_buffers_and_normalization(kind: type, normalize
         found = checkpoints.find_checkpoint(tmp_path)
         assert found is not None
         checkpoints.restore_buffer(found, other)
-        assert checkpoints.load_extra(found) == {"a": (1, 2), "next_training": {}}
+        assert checkpoints.load_extra(found) == {"a": (1, 2)}
         skipped = {name: None for name in ("observation_space", "action_space")}
         mine, theirs = ({**vars(one.replay_buffer), **skipped} for one in (model, other))  # type: ignore[arg-type]
         assert not list(differences(mine, theirs))

@@ -35,11 +35,11 @@ from sb3_cpm.buffers.episode_buffer import EpisodeBuffer
 from sb3_cpm.challenger import Challenger, choose_device, rate_entry
 from sb3_cpm.challenger.file import state_to_check
 from sb3_cpm.dreamer.policies import DreamerPolicy, RecurrentState
-from sb3_cpm.dreamer.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.dreamer.spaces import OBSERVATION, Keyed, as_dict, as_dict_space
 from sb3_cpm.dreamer.start import StartFrom, model_file, read_challenger, take_over_uncertainty
 from sb3_cpm.files import check_finite, verify, write_sealed
 from sb3_cpm.presets import Preset, PresetLike, make_preset
+from sb3_cpm.randomness import RandomState, random_state, restore_random_state
 from sb3_cpm.training_env import WatchedVecEnv
 from sb3_cpm.type_aliases import SequenceBatch
 from sb3_cpm.world_model.correlated_noise import CorrelatedNoise

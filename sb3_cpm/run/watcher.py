@@ -85,8 +85,7 @@ class Watcher(BaseCallback):
 
     def callbacks(self) -> list[BaseCallback]:
         """:return: all of the run in the order that they need: what one reads of another must have happened"""
-        restorer = [] if self.found is None else [checkpoints.ChallengerRestorer(self.found, self.built.callbacks)]
-        return [*self.built.callbacks, *restorer, *([self.recorder] if self.recorder else []), self]
+        return [*self.built.callbacks, *([self.recorder] if self.recorder else []), self]
 
     def learn(self, outputs: list[KVWriter], others: list[BaseCallback]) -> None:
         """
@@ -98,7 +97,7 @@ class Watcher(BaseCallback):
         model, spec = self.built.model, self.spec
         model.set_logger(Logger(None, [DiagnosticsWriter(self.tables["diagnostics"]), *outputs]))
         if self.found is not None:
-            checkpoints.restore_buffer(self.found, model)
+            checkpoints.restore(self.found, model, self.built.callbacks)
         model.learn(
             spec.steps - model.num_timesteps,
             callback=[*self.callbacks(), *others],
