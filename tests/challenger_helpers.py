@@ -24,6 +24,7 @@ SMALL = {
     "critic_units": 16,
     "horizon": 5,
     "imagination_starts": 16,
+    "uncertainty_class": "plan2explore",
     "uncertainty": {"plan2explore": {"heads": 3, "layers": 1, "units": 16}},
 }
 

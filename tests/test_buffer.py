@@ -340,6 +340,23 @@ def test_save_and_load_keep_everything(tmp_path):
     assert [episode.length for episode in loaded.episodes] == [12, 12, 12, 1] * 2
 
 
+def test_a_pickle_from_before_the_books_were_an_object_goes_on():
+    played = Played(n_envs=2, size=30)
+    for step in range(70):
+        played.play([step % 5 == 4, step % 7 == 6])
+    state = played.buffer.__getstate__()
+    books = state.pop("books")
+    state |= {f"_{name}": getattr(books, name) for name in ("n_steps", "current_ep_start", "n_episodes", "n_valid", "began")}
+    state |= {f"_{name}": getattr(books, f"_{name}") for name in ("episodes", "starts", "valid_ends", "earliest_began")}
+    played.buffer, old = CPMBuffer.__new__(CPMBuffer), played.buffer
+    played.buffer.__setstate__(pickle.loads(pickle.dumps(state)))
+    assert played.buffer.episodes == old.episodes and pickle.dumps(played.buffer.books) == pickle.dumps(books)
+    played.buffer.attach_challenger()
+    for step in range(70):
+        played.play([step % 5 == 4, step % 7 == 6])
+    check_transitions(played.buffer.sample(200), played.present())
+
+
 def test_a_pickle_of_another_format_is_refused():
     state = Played().buffer.__getstate__()
     state["format"] = 0

@@ -4,6 +4,7 @@ The replay buffer: trajectories (D), challenges (I), demonstrations.
 ==================  ==================================================
 ``cpm_buffer``      :class:`CPMBuffer`: D and I and the mix of both
 ``episode_buffer``  D by itself: episodes, sampling, hindsight, saving
+``books``           which slots hold which episodes
 ``storage``         its ring of observations
 ``compact``         how a key is stored, ``allocation``: where
 ``sequences``       sequences for the world model

@@ -273,7 +273,7 @@ class CPMBuffer(EpisodeBuffer):
         """:return: number of rows from I and from the demonstrations"""
         of_challenges = self.challenge_ratio if len(self._imaginary) else 0.0
         of_demonstrations = self.demonstration_ratio if self.demonstrations is not None else 0.0
-        if not self._valid_ends[-1]:  # nothing in D, hence nothing in I
+        if not self.books.n_drawable:  # nothing in D, hence nothing in I
             return 0, batch_size
         if self.mix == "row":
             n_imaginary = round(of_challenges * batch_size)
@@ -291,7 +291,7 @@ class CPMBuffer(EpisodeBuffer):
         uniform over all transitions of all challenges.
         """
         n_virtual = int(self.her_ratio * n_original)
-        rows, envs = self._uniform_transitions(n_original, n_virtual)
+        rows, envs = self.books.draw(n_original, n_virtual)
         if not n_imaginary:
             return self._read(rows, envs, n_virtual, env)
         imaginary_rows, imaginary_envs, rewards, is_goal = self._imaginary.sample(n_imaginary, self.n_added)

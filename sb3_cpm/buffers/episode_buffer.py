@@ -2,20 +2,13 @@
 D: whole episodes in a replay buffer that stores every observation once and samples in time independent of its size.
 
 By itself this is a faster ``HerReplayBuffer`` of half the memory; :class:`~sb3_cpm.buffers.CPMBuffer` adds challenges and
-demonstrations. Complete episodes of an environment lie one after another in the ring and end where the unfinished one
-starts, so a transition is drawn by a random number below their total length. Two environments, six slots, e being
-transitions of complete episodes, u of unfinished ones::
-
-    slot            0  1  2  3  4  5
-    environment 0   e  e  e  u  u  .     3 to draw from, the oldest in slot 0
-    environment 1   e  u  u  u  u  .     1, in slot 0: numbers 0 to 3 are the transitions to draw from
+demonstrations. Where episodes lie and how one is drawn is in :mod:`sb3_cpm.buffers.books`.
 """
 
 import copy
 import inspect
 import pickle
 import warnings
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,6 +23,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from typing_extensions import Self
 
 from sb3_cpm.buffers.allocation import InFolder, check_space, in_memory
+from sb3_cpm.buffers.books import EpisodeBooks
 from sb3_cpm.buffers.checks import (
     check_construction,
     check_environment,
@@ -152,20 +146,8 @@ class EpisodeBuffer(HerReplayBuffer):
         # What is read together lies together: at a million transitions, most of the time of `sample` is waiting for memory
         self._outcomes = np.zeros((*shape, 3), dtype=np.float32)
         self._link_views()
-        self._current_ep_start = np.zeros(self.n_envs, dtype=np.int64)
         self.infos = np.empty(shape if self.copy_info_dict else (0, self.n_envs), dtype=object)
-
-        self._episodes: list[deque[Episode]] = [deque() for _ in range(self.n_envs)]
-        # Environments whose oldest, second oldest, ... complete episode starts in a slot
-        self._starts: dict[int, list[int]] = {}
-        self._n_episodes = np.zeros(self.n_envs, dtype=np.int64)
-        # Complete episodes of an environment are contiguous in the ring and end where the current one starts, so their
-        # number of transitions says which slots can be sampled.
-        self._n_valid = np.zeros(self.n_envs, dtype=np.int64)
-        self._valid_ends = np.cumsum(self._n_valid)
-        self._n_steps = 0
-        self._began = np.zeros(self.n_envs, dtype=np.int64)  # number of the step that the unfinished episodes began with
-        self._earliest_began = 0
+        self.books = EpisodeBooks(self.buffer_size, self.n_envs)
 
     def _link_views(self) -> None:
         """SB3's arrays, as views of where the numbers are."""
@@ -182,7 +164,7 @@ class EpisodeBuffer(HerReplayBuffer):
     @property
     def n_added(self) -> int:
         """Number of transitions that D has been given."""
-        return self._n_steps * self.n_envs
+        return self.books.n_steps * self.n_envs
 
     @property
     def nbytes(self) -> int:
@@ -222,23 +204,22 @@ class EpisodeBuffer(HerReplayBuffer):
         encoded = None if ring.goes_on_with(obs) else ring.encode(obs)
         if encoded is not None:
             self._cut_discontinued_episodes(encoded)
-        if self._n_steps - self._earliest_began >= self.buffer_size:
+        if self.books.is_filled_by_one:
             self._refuse_long_episode()
 
-        if pos in self._starts:
-            self._make_room(pos)
+        self._make_room(pos)
         ring.write(pos, encoded)
         ring.write_next(pos, encoded_next, next_obs)
         self.actions[pos] = action
         self.rewards[pos] = reward
         self.dones[pos] = done
-        self.ep_start[pos] = self._current_ep_start
+        self.ep_start[pos] = self.books.current_ep_start
         if self.copy_info_dict:
             self.infos[pos] = infos
         self.timeouts[pos] = 0
         self.pos = (pos + 1) % self.buffer_size
         self.full = self.full or self.pos == 0
-        self._n_steps += 1
+        self.books.n_steps += 1
         dones = done.tolist()
         if True in dones:
             for env_idx, ended in enumerate(dones):
@@ -252,12 +233,12 @@ class EpisodeBuffer(HerReplayBuffer):
         An environment may be reset in the middle of an episode, as a second ``learn()`` does. Its last transition would
         then be taken to lead to the first observation of the new episode, so the old one ends here, as a truncation.
         """
-        for env_idx in np.flatnonzero(self._began < self._n_steps).tolist():
+        for env_idx in self.books.unfinished:
             if not self.ring.continues(env_idx, encoded):
                 self._truncate_episode(env_idx)
 
     def _refuse_long_episode(self) -> None:
-        env_idx = int(np.argmin(self._began))
+        env_idx = self.books.longest_unfinished
         raise ValueError(
             f"Environment {env_idx}: an episode is longer than the {self.buffer_size} transitions that the buffer holds "
             f"per environment. Set buffer_size to more than {self.n_envs} x the longest episode "
@@ -266,33 +247,20 @@ class EpisodeBuffer(HerReplayBuffer):
 
     def _make_room(self, slot: int) -> None:
         """Forget the episodes (and what refers to them) whose first slot is overwritten next."""
-        for env_idx in self._starts.pop(slot):
-            episode = self._episodes[env_idx].popleft()
-            assert episode.start == slot
+        for episode in self.books.overwrite(slot):
             slots = episode.slots(self.buffer_size)
-            self.ring.drop_episode(int(slots[-1]), env_idx)
+            self.ring.drop_episode(int(slots[-1]), episode.env_idx)
             # The parent's way to say "not to be sampled" (it reads this array in `_sample_goals`)
-            self.ep_length[slots, env_idx] = 0
-            self._n_valid[env_idx] -= episode.length
+            self.ep_length[slots, episode.env_idx] = 0
             self._forget(episode)
-        self._valid_ends = np.cumsum(self._n_valid)
 
     def _compute_episode_length(self, env_idx: int) -> None:
         """Book an episode that ends with the newest transition."""
-        start, length = int(self._current_ep_start[env_idx]), self._n_steps - int(self._began[env_idx])
-        episode = Episode(env_idx, start, length, ordinal=int(self._n_episodes[env_idx]))
-        stop = start + length
-        self.ep_length[start : min(stop, self.buffer_size), env_idx] = length
-        self.ep_length[: max(stop - self.buffer_size, 0), env_idx] = length
+        episode = self.books.end(env_idx)
+        stop = episode.start + episode.length
+        self.ep_length[episode.start : min(stop, self.buffer_size), env_idx] = episode.length
+        self.ep_length[: max(stop - self.buffer_size, 0), env_idx] = episode.length
         self.ring.end_episode((stop - 1) % self.buffer_size, env_idx)
-        self._current_ep_start[env_idx] = self.pos
-        self._began[env_idx] = self._n_steps
-        self._earliest_began = int(self._began.min())
-        self._episodes[env_idx].append(episode)
-        self._starts.setdefault(start, []).append(env_idx)
-        self._n_episodes[env_idx] += 1
-        self._n_valid[env_idx] += length
-        self._valid_ends = np.cumsum(self._n_valid)
         self._remember(episode)
 
     def _truncate_episode(self, env_idx: int) -> None:
@@ -321,7 +289,7 @@ class EpisodeBuffer(HerReplayBuffer):
         """
         self._check_can_sample()
         n_virtual = int(self.her_ratio * batch_size)
-        return self._read(*self._uniform_transitions(batch_size, n_virtual), n_virtual, env)
+        return self._read(*self.books.draw(batch_size, n_virtual), n_virtual, env)
 
     def _check_can_sample(self) -> None:
         if not self.episodes_ended:
@@ -331,29 +299,6 @@ class EpisodeBuffer(HerReplayBuffer):
                 "buffer_size to more than twice that, or limit the episodes (gymnasium.wrappers.TimeLimit). A model that was "
                 "loaded needs its replay buffer too: model.load_replay_buffer(path)."
             )
-
-    def _uniform_transitions(self, n: int, n_virtual: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """
-        :param n: number of transitions
-        :param n_virtual: the first so many are for hindsight
-        :return: slots (negative ones count back from the end of the ring) and environments of n transitions of complete
-            episodes, with replacement, each shape ``(n,)``
-        """
-        if n == 0:
-            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        ends = self._valid_ends
-        picks = np.random.randint(ends[-1], size=n)
-        # In the order of memory, reading a large ring takes a seventh less time; the order within a batch means nothing.
-        picks[:n_virtual].sort()
-        picks[n_virtual:].sort()
-        if self.n_envs == 1:
-            envs = np.zeros(n, dtype=np.int64)
-            rows = picks + (self._current_ep_start[0] - ends[0])
-        else:
-            envs = ends.searchsorted(picks, side="right")
-            # oldest + (pick - ends of the environment before)
-            rows = picks + (self._current_ep_start - ends).take(envs)
-        return rows, envs
 
     def _read(
         self,
@@ -470,12 +415,9 @@ class EpisodeBuffer(HerReplayBuffer):
         """
         if not self.episodes_ended:
             raise RuntimeError(f"No complete episode to sample sequences from after {self.n_added} transitions")
-        envs, offsets = draw_starts(self._n_valid, batch_size, length)
-        n_valid = self._n_valid[envs]
-        oldest = self._current_ep_start[envs] - n_valid
-        return read_sequences(
-            self, oldest, n_valid, envs, offsets, length, tuple(self.observations) if keys is None else tuple(keys)
-        )
+        envs, offsets = draw_starts(self.books.n_valid, batch_size, length)
+        wanted = tuple(self.observations) if keys is None else tuple(keys)
+        return read_sequences(self, self.books.oldest(envs), self.books.n_valid[envs], envs, offsets, length, wanted)
 
     def episode_observations(self, episode: Episode, keys: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """
@@ -499,8 +441,7 @@ class EpisodeBuffer(HerReplayBuffer):
         return self.actions[episode.slots(self.buffer_size), episode.env_idx]
 
     def _check_present(self, episode: Episode) -> None:
-        episodes = self._episodes[episode.env_idx]
-        if not episodes or not episodes[0].ordinal <= episode.ordinal <= episodes[-1].ordinal:
+        if not self.books.holds(episode):
             raise ValueError(
                 f"{episode} is no longer in the buffer, which holds {self.buffer_size} transitions per environment"
             )
@@ -508,12 +449,12 @@ class EpisodeBuffer(HerReplayBuffer):
     @property
     def episodes(self) -> list[Episode]:
         """Complete episodes in D, by environment, oldest first."""
-        return [episode for episodes in self._episodes for episode in episodes]
+        return self.books.episodes
 
     @property
     def episodes_ended(self) -> bool:
         """Whether there is a complete episode to sample from."""
-        return bool(self._valid_ends[-1])
+        return self.books.n_drawable > 0
 
     def _transition(self, row: int) -> tuple[Any, ...]:
         """What was given to ``add()``."""
@@ -541,7 +482,7 @@ class EpisodeBuffer(HerReplayBuffer):
 
     def truncate_last_trajectory(self) -> None:
         """As the parent's, and also for an episode that fills the buffer exactly."""
-        unfinished = np.flatnonzero(self._began < self._n_steps).tolist()
+        unfinished = self.books.unfinished
         if unfinished:
             warnings.warn(
                 "The last trajectory in the replay buffer will be truncated. If you are in the same episode as when the "
@@ -641,25 +582,22 @@ class EpisodeBuffer(HerReplayBuffer):
         arguments = self._arguments()
         found = {name: arguments.pop(name) for name in ("observation_space", "action_space")}
         used = self.buffer_size if self.full else self.pos  # the rest is as it was allocated
+        books, arrays_of_books = self.books.state()
         content = {
             "arguments": {name: pack(value, name=name) for name, value in arguments.items()},
             "spaces": {name: pack_space(space, name) for name, space in found.items()},
             "device": str(self.device),
             "pos": self.pos,
             "full": bool(self.full),
-            "n_steps": self._n_steps,
-            "episodes": pack([episode for episodes in self._episodes for episode in episodes], (Episode,)),
-            "starts": [[slot, envs] for slot, envs in self._starts.items()],
+            **books,
+            "episodes": pack(self.books.episodes, (Episode,)),
             "infos": pack(self.infos[:used].tolist(), name="infos"),
             "ring": pack(self.ring.books()),
         }
         arrays = {
             "actions": self.actions[:used],
             "outcomes": self._outcomes[:used],
-            "current_ep_start": self._current_ep_start,
-            "n_episodes": self._n_episodes,
-            "n_valid": self._n_valid,
-            "began": self._began,
+            **arrays_of_books,
             **self.ring.arrays(used),
         }
         return content, {f"{prefix}{name}": array for name, array in arrays.items()}
@@ -670,21 +608,15 @@ class EpisodeBuffer(HerReplayBuffer):
 
         :raises ValueError: if the state does not belong to such a buffer
         """
-        self.pos, self.full, self._n_steps = content["pos"], content["full"], content["n_steps"]
+        self.pos, self.full = content["pos"], content["full"]
         used = self.buffer_size if self.full else self.pos
         self.ring.restore_books(unpack(content["ring"]))
         archive.read_into(f"{prefix}actions", self.actions[:used])
         archive.read_into(f"{prefix}outcomes", self._outcomes[:used])
         for name, array in self.ring.arrays(used).items():
             archive.read_into(f"{prefix}{name}", array)
-        self._current_ep_start, self._n_episodes, self._n_valid, self._began = (
-            archive.array(f"{prefix}{name}") for name in ("current_ep_start", "n_episodes", "n_valid", "began")
-        )
-        self._valid_ends = np.cumsum(self._n_valid)
-        self._earliest_began = int(self._began.min())
-        for episode in unpack(content["episodes"], (Episode,)):
-            self._episodes[episode.env_idx].append(episode)
-        self._starts = {slot: envs for slot, envs in content["starts"]}
+        arrays = {name: archive.array(f"{prefix}{name}") for name in self.books.state()[1]}
+        self.books.restore(content["n_steps"], content["starts"], unpack(content["episodes"], (Episode,)), **arrays)
         infos = unpack(content["infos"])
         for row in range(len(infos)):
             for env_idx in range(self.n_envs):  # one by one: NumPy would take dicts apart
@@ -704,6 +636,12 @@ class EpisodeBuffer(HerReplayBuffer):
                 f"This replay buffer was saved in format {found}, this version of sb3_cpm reads format {FORMAT}: how "
                 "observations are laid out has changed. Collect it anew, or load it with the version that saved it."
             )
+        if "books" not in state:  # pickled before they were an object of their own
+            state["books"] = books = EpisodeBooks(state["buffer_size"], state["n_envs"])
+            episodes = [episode for of_env in state.pop("_episodes") for episode in of_env]
+            arrays = {name: state.pop(f"_{name}") for name in books.state()[1]}
+            books.restore(state.pop("_n_steps"), state.pop("_starts").items(), episodes, **arrays)
+            del state["_valid_ends"], state["_earliest_began"]
         super().__setstate__(state)
         self._link_views()
 
