@@ -4,7 +4,7 @@ How much of an environment is seen without any reward: share of the cells of a s
 ::
 
     python benchmarks/coverage.py run --env mountaincar maze_medium --seed 10 11 12 13 14 15 16 17 18 19
-    python benchmarks/coverage.py run --agent challenger --env maze_medium --seed 100 101 --preset '{horizon: 15}' --name h15
+    python benchmarks/coverage.py run --agent challenger --env maze_medium --seed 100 --preset '{horizon: 15}' --name h15
     python benchmarks/coverage.py plot
 
 The cells are position x velocity on MountainCarContinuous-v0, positions in the free part of the two mazes, where every episode

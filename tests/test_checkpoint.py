@@ -226,6 +226,20 @@ def test_killed_before_the_first_episode_ended(tmp_path: Path) -> None:
     assert model.num_timesteps == 100
 
 
+def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed at 250, run once more, and run once more when it is finished."""
+    text = (Path(__file__).parents[1] / "docs/files.md").read_text(encoding="utf-8")
+    example = text.split("## A run of your own")[1].split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    killed = example.replace("[challenger, saver]", "[challenger, saver, StopsAt(250)]")
+    assert killed != example
+    with pytest.raises(InterruptedError):
+        exec(killed, {"StopsAt": StopsAt})
+    for before in (200, 400):
+        assert resume("runs/mine", toy())[0].num_timesteps == before
+        exec(example, {})
+
+
 # ---------------------------------------------------------------------- the disk, and what is not worth saving
 
 

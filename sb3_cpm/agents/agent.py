@@ -169,9 +169,14 @@ def load_agent(name_or_path: str | Path, env_id: str, overrides: Mapping[str, An
     entry = find_entry(read_entries(path), env_id, path)
     merged = merge(entry, overrides or {})
     algo = algorithm_of(path.stem)
-    check_hyperparameters(entry, algo, env_id, path)
-    if overrides:
+    try:
+        check_hyperparameters(merged, algo, env_id, path)
+    except ValueError:
+        if not overrides:
+            raise
+        check_hyperparameters(entry, algo, env_id, path)  # is it the file's fault?
         check_hyperparameters(merged, algo, env_id, f"What is given on top of {path.name}")
+        raise
     return Agent(path.stem, algo, env_id, merged, path)
 
 

@@ -104,7 +104,6 @@ class Run:
             undo.callback(self.built.env.close)
             self.model = self.built.model
             self._steps_before = self.model.num_timesteps
-            check_length(spec, self.model)
             self.eval_env: VecEnv = self.built.make_eval_env(render=options.video)
             undo.callback(self.eval_env.close)
             run_folder.write_config(folder, run_folder.description(spec, agent))

@@ -14,7 +14,7 @@ from sb3_cpm.extras import check_installed
 from sb3_cpm.files import locked
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.arguments import misspelt_names_told
-from sb3_cpm.run.execution import Run, RunOptions
+from sb3_cpm.run.execution import Run, RunOptions, check_length
 from sb3_cpm.run.settings import TrainSettings
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import Summary
@@ -87,6 +87,7 @@ def _begin(settings: TrainSettings, callback: BaseCallback | None) -> Summary:
         new.discard()
         raise
     try:
+        check_length(spec, run.model)
         return _execute(run, callback)
     finally:
         if run.model.num_timesteps == 0:
