@@ -11,7 +11,8 @@ The cells are position x velocity on MountainCarContinuous-v0, positions in the 
 begins in the same corner, and positions of the puck on CPMToy-v0, which is seen by a camera and has to be pushed. All agents
 have the same episodes (of the same length, without an early end) and the same first random steps, and never see a reward.
 ``challenger`` explores as that of ``ChallengerCallback()`` does: its default preset, an update every 8 steps.
-``plan2explore`` and ``rnd`` are the same with the uncertainty class of that name; ``pink`` is pink noise (pink-noise-rl). Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is complete;
+``plan2explore`` and ``rnd`` are the same with the uncertainty class of that name; ``pink`` is pink noise (pink-noise-rl).
+Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is complete;
 complete runs are skipped. ``plot`` draws ``results/coverage/coverage.png`` and writes ``results/coverage/summary.csv``, means
 over seeds with 95% confidence intervals. With ``--preset`` (entries as YAML) and ``--name`` an agent of another preset is
 tried, whose results lie in ``results/coverage-trials/NAME``.

@@ -41,7 +41,7 @@ def train(settings: TrainSettings | None = None, callback: BaseCallback | None =
     if settings is not None and changes:
         raise ValueError(f"Give either settings or single values, not both: {sorted(changes)}")
     settings = settings or TrainSettings(**changes)
-    check_installed("Runs", ("tensorboard", *(["imageio"] if settings.video else [])), "run")
+    check_installed("Runs", ("tensorboard", "matplotlib", *(["imageio"] if settings.video else [])), "run")
     if settings.resume is not None:
         return _go_on(Path(settings.resume), settings, callback)
     with misspelt_names_told(settings.as_dict()):
