@@ -211,11 +211,13 @@ def restore(checkpoint: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCall
         saved = archive.content["challengers"]
     restore_buffer(checkpoint, model)
     buffer = getattr(model, "replay_buffer", None)
-    if isinstance(buffer, CPMBuffer):  # the episodes that end here are the challenger's, as those that end in learn()
-        buffer.has_challenger = bool(saved)
+    if (
+        isinstance(buffer, CPMBuffer) and saved
+    ):  # the episodes that end here are the challenger's, as those that end in learn()
+        buffer.attach_challenger()
     begin_episodes(model)
     if isinstance(buffer, CPMBuffer):
-        buffer.has_challenger = False
+        buffer.detach_challenger()
     for index, entry in saved.items():
         callback = callbacks[int(index)]
         assert isinstance(callback, ChallengerCallback)

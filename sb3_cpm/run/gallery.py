@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from sb3_cpm.challenges import Proposal
-from sb3_cpm.run.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE, save_figure
+from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE, save_figure
 from sb3_cpm.run.recorder import Shot
 
 CRITERIA = {
@@ -32,7 +32,6 @@ CRITERIA = {
 #: Frames of a film strip.
 N_FRAMES = 12
 FIGURE_WIDTH = 13.0
-BLACK = "#1a202c"
 EXPLANATION = (
     "Each row is one trajectory: camera frames along the time axis; below them what the challenger thought of every step. "
     "The goal is the state with the highest score.\nShaded: the part up to the goal. The filter keeps it as a challenge if at "
