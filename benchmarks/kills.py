@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 #: A player and a challenger that take seconds.
 SMALL_CHALLENGER = "challenger_kwargs={batch_size: 4, sequence_length: 16, imagination_starts: 8, horizon: 5}"
-EVERY, STEPS = 100, 700
+EVERY, STEPS = 100, 500
 
 
 class Train:
