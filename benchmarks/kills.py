@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 #: A player and a challenger that take seconds.
 SMALL_CHALLENGER = "challenger_kwargs={batch_size: 4, sequence_length: 16, imagination_starts: 8, horizon: 5}"
-EVERY, STEPS = 100, 700
+EVERY, STEPS = 100, 500
 
 
 class Train:
@@ -131,15 +131,17 @@ def main() -> int:
                 broken, counts, costs, kills = FRONTS[front](folder, args.n_envs), Counter(), [], 0
                 while kills < args.kills:
                     status = run(broken.command(), number, chance.uniform(0.1, 0.9) * seconds)
+                    ended = (broken.tables / "finished.yml").exists()  # perhaps just before the signal came
                     kills += status != 0
                     counts["killed" if status else "ended before"] += 1
-                    if status == 0:
+                    if ended:
                         counts["equal" if tables(broken.tables) == wanted else "DIFFERENT"] += 1
                         shutil.rmtree(folder)
                     else:
                         costs.append(max(last_step(broken.tables) - checkpoint_step(broken.tables), 0))
-                run(broken.command())
-                counts["equal" if tables(broken.tables) == wanted else "DIFFERENT"] += 1
+                if broken.tables.exists():
+                    run(broken.command())
+                    counts["equal" if tables(broken.tables) == wanted else "DIFFERENT"] += 1
                 most = max(costs, default=0)
                 failed += counts["DIFFERENT"] + (most > (EVERY if front == "train" else STEPS))
                 told = ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -15,6 +15,7 @@ from typing import Any
 from sb3_cpm import __version__
 from sb3_cpm.extras import install_command, needed
 from sb3_cpm.run.settings import TrainSettings, field_documentation
+from sb3_cpm.run.signals import sigterm_raises
 
 EPILOG = """examples:
   python -m sb3_cpm train --agent cpm_sac_quick                 CPM-SAC on PickCube-v1, shortened to an hour without a GPU
@@ -217,8 +218,12 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
             if list or figure is None:
                 print(experiments.listing())
                 return 0
-            return experiments.reproduce(figure, **arguments)
+            with sigterm_raises():
+                return experiments.reproduce(figure, **arguments)
     except BrokenPipeError:
+        raise
+    except (KeyboardInterrupt, SystemExit):
+        print("Cut off. The same command goes on: with what is unfinished, from its newest checkpoint.", file=sys.stderr)
         raise
     except OSError as error:  # a disk that is full or must not be written; what was written before stays
         raise RuntimeError(

@@ -28,7 +28,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_cpm.buffers import EpisodeBuffer
+from sb3_cpm.buffers import CPMBuffer, EpisodeBuffer
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import (
     Archive,
@@ -207,10 +207,17 @@ def restore(checkpoint: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCall
     :param callbacks: like those that were saved; challengers among them get their state back, before ``learn()``
     :raises ValueError: if a challenger does not fit, or the environment is normalized otherwise
     """
-    restore_buffer(checkpoint, model)
-    begin_episodes(model)
     with Archive(checkpoint / STATE, "checkpoint") as archive:
         saved = archive.content["challengers"]
+    restore_buffer(checkpoint, model)
+    buffer = getattr(model, "replay_buffer", None)
+    if (
+        isinstance(buffer, CPMBuffer) and saved
+    ):  # the episodes that end here are the challenger's, as those that end in learn()
+        buffer.attach_challenger()
+    begin_episodes(model)
+    if isinstance(buffer, CPMBuffer):
+        buffer.detach_challenger()
     for index, entry in saved.items():
         callback = callbacks[int(index)]
         assert isinstance(callback, ChallengerCallback)

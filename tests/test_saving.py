@@ -436,7 +436,7 @@ SMALL_RUN: dict[str, Any] = {
 def test_a_full_disk_does_not_end_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Models are too large for it, tables and logs are not."""
     folder = tmp_path / "run"
-    with files_of_at_most(60_000):
+    with files_of_at_most(30_000):
         summary = train(run_folder=str(folder), **SMALL_RUN)
     told = capsys.readouterr()
     assert summary.outcome == "finished" and summary.steps == 120

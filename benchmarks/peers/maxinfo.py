@@ -54,7 +54,7 @@ def main() -> None:
             patch.object(agent, "algorithms", lambda: {**algorithms(), "sac": Peer}),
             # it cannot be loaded again, so that a run goes from beginning to end
             patch("sb3_cpm.checkpoint.save_checkpoint", lambda *arguments: None),
-            patch("sb3_cpm.experiments.single_run.find_twin", lambda *arguments: None),
+            patch("sb3_cpm.experiments.single_run.find_same_run", lambda *arguments: None),
         ):
             print(perform(spec, args.results, print), flush=True)
 

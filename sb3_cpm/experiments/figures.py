@@ -21,9 +21,9 @@ from matplotlib.ticker import MaxNLocator
 from sb3_cpm.experiments.collect import Data, collect
 from sb3_cpm.experiments.specification import Experiment
 from sb3_cpm.experiments.statistics import binned, estimate, per_seed
-from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, PURPLE, RED, STYLE
+from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, PURPLE, RED, STYLE, TEAL
 
-COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, PINK, BLACK)
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, PINK, BLACK, TEAL)
 #: Agents of several experiments look alike in all of them; the others take what is left.
 USUAL_COLOURS = {
     "SAC": BLUE,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sb3_cpm.agents import load_agent
+from sb3_cpm.experiments.shared_runs import find_same_run, take_over
 from sb3_cpm.experiments.specification import RunResult
-from sb3_cpm.experiments.twins import find_twin, take_over
 from sb3_cpm.files import DamagedRunError, locked
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.execution import Run, RunOptions
@@ -38,9 +38,9 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
             run_folder.remove_crashed(folder)  # of a try that ended before it saw that
             return RunResult(spec, "skipped", note or "its result is there", folder)
         run_folder.check_may_go_on(folder, note)
-        twin = None if run_folder.has_checkpoint(folder) else find_twin(spec, config, results)
-        if twin is not None:
-            return RunResult(spec, "skipped", f"taken from {take_over(spec, config, twin, results)}", folder)
+        other = None if run_folder.has_checkpoint(folder) else find_same_run(spec, config, results)
+        if other is not None:
+            return RunResult(spec, "skipped", f"taken from {take_over(spec, config, other, results)}", folder)
         summary = Run(spec, agent, folder, RunOptions(device=device), tell).execute()
     return RunResult(spec, "finished", f"{summary.seconds:.0f} s", folder)
 

@@ -6,15 +6,13 @@ ends a run (the last step, Ctrl-C, SIGTERM, an exception), what was written stay
 """
 
 import contextlib
-import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
@@ -28,12 +26,10 @@ from sb3_cpm.agents import Agent, Built
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.files import DamagedRunError, NotFiniteError, NotWrittenError, disk_errors_named
 from sb3_cpm.run import folder as run_folder
+from sb3_cpm.run.signals import TERMINATED, sigterm_raises, undisturbed
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import NOT_TRAINING, Summary, complete_times, evaluated, peak_memory_gb
 from sb3_cpm.run.watcher import Watcher
-
-#: Exit status of a process that SIGTERM has ended, as shells count it.
-TERMINATED = 128 + signal.SIGTERM
 
 
 @dataclass(frozen=True)
@@ -124,10 +120,10 @@ class Run:
             with sigterm_raises():
                 self.watcher.learn(self._outputs(), others)
         except BaseException as error:
-            with _undisturbed():
+            with undisturbed():
                 self._leave(_describe_end(error))
             raise
-        with _undisturbed():
+        with undisturbed():
             return self._leave("finished")
 
     def _make_progress_bar(self) -> ProgressBarCallback | None:
@@ -261,47 +257,6 @@ def check_length(spec: RunSpec, model: Any) -> None:
             f"steps={spec.steps} is no longer than learning_starts={first}, the steps before the first update: nothing would "
             f"be learned. Set steps above {first}, or learning_starts lower."
         )
-
-
-# ---------------------------------------------------------------------- ends
-
-
-@contextlib.contextmanager
-def sigterm_raises() -> Iterator[None]:
-    """
-    Within it SIGTERM, by which schedulers end jobs, is an exception as Ctrl-C is: files and environments are closed.
-
-    :raises SystemExit: with status 143 when the signal comes
-    """
-
-    def end(number: int, frame: FrameType | None) -> NoReturn:
-        raise SystemExit(TERMINATED)
-
-    try:
-        previous = signal.signal(signal.SIGTERM, end)
-    except ValueError:  # not in the main thread, where no signal arrives
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """An impatient second Ctrl-C or SIGTERM must not spoil what is being written."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    try:
-        previous = [signal.signal(number, signal.SIG_IGN) for number in numbers]
-    except ValueError:  # not in the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def _describe_end(error: BaseException) -> str:

@@ -19,10 +19,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from sb3_cpm.challenges import Proposal
-from sb3_cpm.run.plots import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE, save_figure
+from sb3_cpm.run.plots import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE, save_figure
 from sb3_cpm.run.recorder import Shot
 
-CRITERIA = {
+CRITERION_NAMES = {
     "novel": "F1 novel enough",
     "relevant": "F2 relevant to the task",
     "highlight": "F3 a highlight",
@@ -32,7 +32,6 @@ CRITERIA = {
 #: Frames of a film strip.
 N_FRAMES = 12
 FIGURE_WIDTH = 13.0
-BLACK = "#1a202c"
 EXPLANATION = (
     "Each row is one trajectory: camera frames along the time axis; below them what the challenger thought of every step. "
     "The goal is the state with the highest score.\nShaded: the part up to the goal. The filter keeps it as a challenge if at "
@@ -204,7 +203,7 @@ def _draw_verdict(axes: Axes, proposal: Proposal) -> None:
     axes.text(
         0.14, 0.97, word, color="white", fontsize=13, fontweight="bold", va="top", bbox={"fc": colour, "ec": colour, "pad": 4}
     )
-    for row, (name, text) in enumerate(CRITERIA.items()):
+    for row, (name, text) in enumerate(CRITERION_NAMES.items()):
         y = 0.78 - 0.095 * row
         holds = proposal.verdicts[name]
         axes.text(

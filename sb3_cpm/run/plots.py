@@ -13,7 +13,7 @@ from sb3_cpm.files import replacing, write_text
 from sb3_cpm.run.tables import read_csv
 
 BLUE, ORANGE, GREEN, RED, GREY, PURPLE = "#2b6cb0", "#dd6b20", "#2f855a", "#c53030", "#718096", "#6b46c1"
-PINK, BLACK = "#d53f8c", "#1a202c"
+PINK, BLACK, TEAL = "#d53f8c", "#1a202c", "#319795"
 STYLE: dict[str, Any] = {
     "figure.dpi": 110,
     "font.size": 10,

@@ -16,7 +16,7 @@ from sb3_cpm.run.stored_run import read_run
 from sb3_cpm.run.tables import EVALUATIONS, Table
 
 
-def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:
+def find_same_run(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | None:
     """
     :param spec: a run
     :param config: its :func:`~sb3_cpm.run.folder.description`
@@ -39,20 +39,20 @@ def find_twin(spec: RunSpec, config: dict[str, Any], results: Path) -> Path | No
     return None
 
 
-def take_over(spec: RunSpec, config: dict[str, Any], twin: Path, results: Path) -> str:
+def take_over(spec: RunSpec, config: dict[str, Any], other: Path, results: Path) -> str:
     """
-    Make a run's folder from its twin's. What says that it is finished comes last, so that a killed process leaves no half.
+    Make a run's folder from its other's. What says that it is finished comes last, so that a killed process leaves no half.
 
     :param spec: the run
-    :param config: its description; ``taken_from`` is added to what is written, and the versions are the twin's
-    :param twin: from :func:`find_twin`
+    :param config: its description; ``taken_from`` is added to what is written, and the versions are the other's
+    :param other: the same run under another name, from :func:`find_same_run`
     :param results: folder of all results
-    :return: the twin's name
+    :return: the other's name
     """
-    folder, name = spec.folder(results), "/".join(twin.parts[-4:])
-    theirs, finished = (run_folder.read_yaml(twin / file) for file in (run_folder.CONFIG, run_folder.FINISHED))
+    folder, name = spec.folder(results), "/".join(other.parts[-4:])
+    theirs, finished = (run_folder.read_yaml(other / file) for file in (run_folder.CONFIG, run_folder.FINISHED))
     names = {"experiment": spec.experiment, "agent": spec.agent, "env": spec.env}
-    for path in twin.glob("*.csv"):
+    for path in other.glob("*.csv"):
         if path.stem != "evaluations":
             write_bytes(folder / path.name, path.read_bytes())
             continue
