@@ -4,14 +4,15 @@ How much of an environment is seen without any reward: share of the cells of a s
 ::
 
     python benchmarks/coverage.py run --env mountaincar maze_medium --seed 10 11 12 13 14 15 16 17 18 19
-    python benchmarks/coverage.py run --agent challenger --env maze_medium --seed 100 --preset '{horizon: 15}' --name h15
+    python benchmarks/coverage.py run --agent plan2explore --env maze_medium --seed 100 --preset '{horizon: 15}' --name h15
     python benchmarks/coverage.py plot
 
 The cells are position x velocity on MountainCarContinuous-v0, positions in the free part of the two mazes, where every episode
 begins in the same corner, and positions of the puck on CPMToy-v0, which is seen by a camera and has to be pushed. All agents
 have the same episodes (of the same length, without an early end) and the same first random steps, and never see a reward.
-``challenger`` explores as that of ``ChallengerCallback()`` does: its default preset, an update every 8 steps.
-``plan2explore`` and ``rnd`` are the same with the uncertainty class of that name; ``pink`` is pink noise (pink-noise-rl).
+``plan2explore`` explores as the challenger of ``ChallengerCallback()`` does: its default preset, an update every 8 steps.
+``observation_ensemble`` and ``rnd`` are the same with the uncertainty class of that name; ``pink`` is pink noise
+(pink-noise-rl).
 Every run writes ``results/coverage/AGENT/ENV/seedN.csv`` when it is complete;
 complete runs are skipped. ``plot`` draws ``results/coverage/coverage.png`` and writes ``results/coverage/summary.csv``, means
 over seeds with 95% confidence intervals. With ``--preset`` (entries as YAML) and ``--name`` an agent of another preset is
@@ -33,13 +34,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_cpm.dreamer import Plan2Explore
 from sb3_cpm.envs.toy import ToyEnv
-from sb3_cpm.presets import DEFAULT
+from sb3_cpm.uncertainty import UNCERTAINTY_CLASSES
 
 FOLDER = Path(__file__).parents[1] / "results" / "coverage"
 TRIALS = FOLDER.with_name("coverage-trials")
 NAMES = {
-    "challenger": "the challenger",
-    "plan2explore": "Plan2Explore",
+    "plan2explore": "Plan2Explore (default)",
+    "observation_ensemble": "ensemble of embeddings",
     "rnd": "RND",
     "pink": "pink noise",
     "random": "random actions",
@@ -129,7 +130,7 @@ def explore(model_env: VecEnv, agent: str, task: Task, seed: int, preset: dict[s
     model = Plan2Explore(
         policy, model_env, seed=seed, device="cpu", preset=preset,
         learning_starts=task.steps if agent == "random" else LEARNING_STARTS, train_freq=train_freq,
-        uncertainty_class=agent if agent in ("rnd", "plan2explore") else DEFAULT.uncertainty_class,
+        uncertainty_class=agent if agent in UNCERTAINTY_CLASSES else "plan2explore",
     )  # fmt: skip
     model.learn(task.steps, log_interval=None)
 

@@ -218,6 +218,10 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
             if list or figure is None:
                 print(experiments.listing())
                 return 0
+            if arguments["device"] != "cpu":
+                from sb3_cpm.run.execution import check_device
+
+                check_device(arguments["device"])
             with sigterm_raises():
                 return experiments.reproduce(figure, **arguments)
     except BrokenPipeError:

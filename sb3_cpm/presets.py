@@ -6,12 +6,11 @@ and of what is made of its challenges (4.3 and B.6).
 vectors, such as the robot's state, and has a continue head; the report has neither. ``"report_images"`` is the report's own
 world model: images only, and two heads, for images and reward. Both leave out the actor-critic for the task, which the report
 trains beside that for exploration (``train_task_behavior=True``), and by which C never acts. The number of ensemble heads is
-not in the report; 10 is ours. ``"default"`` measures novelty by an ensemble of embeddings of observations instead of latents,
-and is small enough for two CPU cores: an update takes about 0.03 CPU seconds for vectors and 0.06 for two 32x32 cameras.
-``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate 800 x 15 imagined steps: without a GPU
-add ``imagination_starts=256``, which needs a third of that. A preset of your own is a dict with the entries that differ from
-``"default"``; every entry can also be given to :class:`~sb3_cpm.challenger.Challenger` as a keyword argument. :class:`Preset`
-says what each of them means.
+not in the report; 10 is ours. ``"default"`` is small enough for two CPU cores: an update takes about 0.03 CPU seconds for
+vectors and 0.06 for two 32x32 cameras. ``"report"`` takes 4 to 6 on one core, nearly all of it for ten large heads that rate
+800 x 15 imagined steps: without a GPU add ``imagination_starts=256``, which needs a third of that. A preset of your own is a
+dict with the entries that differ from ``"default"``; every entry can also be given to
+:class:`~sb3_cpm.challenger.Challenger` as a keyword argument. :class:`Preset` says what each of them means.
 """
 
 from collections.abc import Mapping
@@ -277,8 +276,6 @@ DEFAULT = replace(
     actor_units=128,
     critic_layers=2,
     critic_units=128,
-    # tells new from known where an ensemble of latents hardly does (docs/world_model.md)
-    uncertainty_class="observation_ensemble",
     uncertainty={
         "plan2explore": {"heads": 5, "layers": 2, "units": 128, "target": "feat", "metric": "exp"},
         "rnd": {"layers": 3, "units": 128, "output_dim": 64},
@@ -291,7 +288,7 @@ DEFAULT = replace(
 REPORT_IMAGES = replace(REPORT, read_vectors=False, continue_head=False)
 
 #: The same networks for an agent that learns from its imagination alone, as Dreamer does: larger updates.
-DREAMER = replace(DEFAULT, sequence_length=32, horizon=15, imagination_starts=64, uncertainty_class="plan2explore")
+DREAMER = replace(DEFAULT, sequence_length=32, horizon=15, imagination_starts=64)
 
 PRESETS: dict[str, Preset] = {"default": DEFAULT, "dreamer": DREAMER, "report": REPORT, "report_images": REPORT_IMAGES}
 

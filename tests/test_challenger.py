@@ -112,7 +112,7 @@ def test_evaluation_has_one_opinion_per_transition(n_steps: int) -> None:
 
 
 def test_evaluation_is_that_of_following_step_by_step() -> None:
-    challenger, batch = small(uncertainty_class="plan2explore"), random_batch(VECTOR, 2, 6, 1)
+    challenger, batch = small(), random_batch(VECTOR, 2, 6, 1)
     batch.is_first[1:] = False
     observations = batch.observations["state"][:, 0]
     evaluation = challenger.evaluate({"state": observations}, batch.actions[1:, 0])

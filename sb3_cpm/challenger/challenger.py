@@ -54,8 +54,7 @@ class Challenger:
         entries, see :mod:`sb3_cpm.presets`
     :param keys: the observation keys to read; all images, and vectors unless the preset leaves them out, by default
     :param uncertainty_class: "plan2explore", "rnd", "prediction_error", "observation_ensemble" (see
-        :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`. None: the preset's, which
-        is "observation_ensemble" in the default and "plan2explore" in the report's
+        :mod:`sb3_cpm.uncertainty`) or a subclass of :class:`~sb3_cpm.uncertainty.base.Uncertainty`. None: the preset's
     :param uncertainty_kwargs: arguments for it, on top of the preset's
     :param overrides: single preset entries
     :raises ValueError: for spaces it cannot work with, unknown preset entries, and arguments that no file can hold

@@ -81,13 +81,12 @@ PRINTED = Contender(
         }
     },
 )
-#: Updates as large and as seldom as they were before they became cheap, with white noise and an ensemble of latents.
+#: Updates as large and as seldom as they were before they became cheap, with white noise.
 FORMER = Contender(
     "CPM-SAC, seldom large updates",
     "cpm_sac",
     challenger(
         train_freq=25,
-        uncertainty_class="plan2explore",
         decay_kwargs={"start": 0.9, "floor": 0.05},
         challenger_kwargs={
             "sequence_length": 32,
@@ -98,7 +97,6 @@ FORMER = Contender(
         },
     ),
 )
-CPM_LATENT = Contender("CPM-SAC, latent ensemble", "cpm_sac", challenger(uncertainty_class="plan2explore"))
 CPM_RND = Contender("CPM-SAC, RND", "cpm_sac", challenger(uncertainty_class="rnd"))
 DREAMER = Contender("Dreamer", "dreamer")
 PLAN2EXPLORE = Contender("Plan2Explore", "plan2explore")
@@ -188,7 +186,7 @@ _ALL = (
         "",
         "MountainCarContinuous-v0: how soon the reward is found",
         "not in the report: explorers beside each other on seeds that nothing was chosen on",
-        (SAC, CPM, CPM_LATENT, PRINTED, FORMER, CPM_RND, PLAN2EXPLORE, ZOO_SDE, PINK),
+        (SAC, CPM, PRINTED, FORMER, CPM_RND, PLAN2EXPLORE, ZOO_SDE, PINK),
         "curves",
         Plan((MOUNTAINCAR,), 10_000, 2_000, 5, 10, {}, "1 (SAC) to 3 CPU minutes per run, by processor", 10),
         Plan((MOUNTAINCAR,), 2_000, 1_000, 3, 1, {}, "1 minute on 2 cores", 10),

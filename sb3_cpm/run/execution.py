@@ -249,16 +249,6 @@ def check_device(device: str) -> None:
         ) from error
 
 
-def check_length(spec: RunSpec, model: Any) -> None:
-    """:raises ValueError: for a run that ends before the first update, and would look finished"""
-    first = getattr(model, "learning_starts", 0)
-    if spec.steps <= first:
-        raise ValueError(
-            f"steps={spec.steps} is no longer than learning_starts={first}, the steps before the first update: nothing would "
-            f"be learned. Set steps above {first}, or learning_starts lower."
-        )
-
-
 def _describe_end(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "stopped by Ctrl-C"

@@ -2,6 +2,7 @@
 ``python -m sb3_cpm train``: an agent on a task, from settings to a folder of results, and on again where it was cut off.
 """
 
+import inspect
 import shlex
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cpm.agents import Agent, load_agent
+from sb3_cpm.agents.algorithms import algorithms
 from sb3_cpm.agents.tasks import imported, task_id
 from sb3_cpm.extras import check_installed
 from sb3_cpm.files import locked
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.arguments import misspelt_names_told
-from sb3_cpm.run.execution import Run, RunOptions, check_length
+from sb3_cpm.run.execution import Run, RunOptions
 from sb3_cpm.run.settings import TrainSettings
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.summary import Summary
@@ -66,7 +68,7 @@ def specification(settings: TrainSettings) -> tuple[RunSpec, Agent]:
         agent=agent.name,
         env=env_id,
         seed=settings.seed,
-        config=settings.agent,
+        config=settings.agent if Path(settings.agent).suffix == "" else str(agent.path.resolve()),
         env_id=env_id,
         overrides=overrides,
         steps=steps,
@@ -75,7 +77,19 @@ def specification(settings: TrainSettings) -> tuple[RunSpec, Agent]:
         checkpoint_every=settings.checkpoint_freq,
         module=module,
     )
+    check_length(spec, agent)
     return spec, agent
+
+
+def check_length(spec: RunSpec, agent: Agent) -> None:
+    """:raises ValueError: for a run that ends before the first update, and would look finished"""
+    default = inspect.signature(algorithms()[agent.algo]).parameters.get("learning_starts")
+    first = agent.hyperparameters.get("learning_starts", 0 if default is None else default.default)
+    if spec.steps <= first:
+        raise ValueError(
+            f"steps={spec.steps} is no longer than learning_starts={first}, the steps before the first update: nothing would "
+            f"be learned. Set steps above {first}, or learning_starts lower."
+        )
 
 
 def _begin(settings: TrainSettings, callback: BaseCallback | None) -> Summary:
@@ -87,7 +101,6 @@ def _begin(settings: TrainSettings, callback: BaseCallback | None) -> Summary:
         new.discard()
         raise
     try:
-        check_length(spec, run.model)
         return _execute(run, callback)
     finally:
         if run.model.num_timesteps == 0:
@@ -125,11 +138,21 @@ def _go_on(folder: Path, settings: TrainSettings, callback: BaseCallback | None)
                 f"resume={str(folder)!r}: this run has come to its end, there is nothing to go on with. A longer one is a new "
                 "run: give the same settings and more steps."
             )
-        spec = RunSpec(**stored["run"])
+        spec = _stored_spec(folder, stored["run"])
         imported(spec.module, spec.env_id)
         agent = load_agent(spec.config, task_id(spec.env_id), spec.overrides)
         run_folder.check_may_go_on(folder, run_folder.check_belongs(folder, run_folder.description(spec, agent)))
         return _execute(Run(spec, agent, folder, _options(settings), say), callback)
+
+
+def _stored_spec(folder: Path, stored: Any) -> RunSpec:
+    """:raises ValueError: for entries that are none of a run"""
+    try:
+        return RunSpec(**stored)
+    except TypeError as error:
+        raise ValueError(
+            f"resume={str(folder)!r}: its {run_folder.CONFIG} is damaged, or of another version: {error}. Begin the run anew."
+        ) from error
 
 
 def _execute(run: Run, callback: BaseCallback | None) -> Summary:
