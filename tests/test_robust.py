@@ -406,7 +406,8 @@ def test_ctrl_c_in_a_training_run_with_workers(tmp_path: Path) -> None:
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
     )
     deadline = time.monotonic() + 600
-    while not ((folder / "episodes.csv").exists() and len((folder / "episodes.csv").read_text().splitlines()) > 3):
+    episodes = folder / "training.csv"
+    while not (episodes.exists() and len(episodes.read_text().splitlines()) > 3):
         assert child.poll() is None and time.monotonic() < deadline
         time.sleep(0.2)
     os.killpg(child.pid, signal.SIGINT)
