@@ -48,7 +48,7 @@ from sb3_cpm.type_aliases import SequenceBatch
 
 #: Changes whenever a buffer of an earlier release could be misread: of one that was pickled, and of one in a file of ours.
 FORMAT, FILE_FORMAT = 2, 3
-_VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+_VIEWS = ("observations", "next_observations", "rewards", "dones", "timeouts", "ep_start", "ep_length", "_current_ep_start")
 #: Arguments that belong to where a buffer is used, and what else ``locals()`` has
 NOT_SAVED = ("self", "__class__", "env", "device")
 # Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
@@ -145,14 +145,15 @@ class EpisodeBuffer(HerReplayBuffer):
         self.actions = np.zeros((*shape, self.action_dim), dtype=self.actions.dtype)
         # What is read together lies together: at a million transitions, most of the time of `sample` is waiting for memory
         self._outcomes = np.zeros((*shape, 3), dtype=np.float32)
-        self._link_views()
         self.infos = np.empty(shape if self.copy_info_dict else (0, self.n_envs), dtype=object)
         self.books = EpisodeBooks(self.buffer_size, self.n_envs)
+        self._link_views()
 
     def _link_views(self) -> None:
         """SB3's arrays, as views of where the numbers are."""
         self.rewards, self.dones, self.timeouts = (self._outcomes[:, :, i] for i in range(3))
         self.ep_start, self.ep_length = (self.ring.spans[:, :, i] for i in range(2))
+        self._current_ep_start = self.books.current_ep_start
         self.observations = self.ring.observations
         self.next_observations = {key: NextObservationView(self.ring, key) for key in self.observations}  # type: ignore[misc]
 
@@ -617,6 +618,7 @@ class EpisodeBuffer(HerReplayBuffer):
             archive.read_into(f"{prefix}{name}", array)
         arrays = {name: archive.array(f"{prefix}{name}") for name in self.books.state()[1]}
         self.books.restore(content["n_steps"], content["starts"], unpack(content["episodes"], (Episode,)), **arrays)
+        self._link_views()
         infos = unpack(content["infos"])
         for row in range(len(infos)):
             for env_idx in range(self.n_envs):  # one by one: NumPy would take dicts apart
