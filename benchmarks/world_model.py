@@ -1,6 +1,6 @@
 """
-What the challenger costs: its world model, imagination and ensemble beside sheeprl's, its two kinds of latents beside each
-other, and its share of a run.
+What the challenger costs: its world model, imagination and ensemble beside sheeprl's, whole updates beside r2dreamer's, its
+two kinds of latents beside each other, and its share of a run.
 
 ::
 
@@ -8,6 +8,10 @@ other, and its share of a run.
     OMP_NUM_THREADS=1 python benchmarks/world_model.py                      # all rows, 15 minutes
     OMP_NUM_THREADS=1 python benchmarks/world_model.py --rows model32 ensemble --threads 1 --repeats 7
     python benchmarks/world_model.py --device cuda                          # also with `compile` and bfloat16, 3 minutes
+
+    pip install tensordict hydra-core==1.3.2                                # the second peer, which is no package
+    git clone https://github.com/NM512/r2dreamer PATH_OF_A_CHECKOUT
+    OMP_NUM_THREADS=1 python benchmarks/world_model.py --r2dreamer PATH_OF_A_CHECKOUT --rows r2dreamer32 --threads 1
 
 sheeprl's own compiler takes more than 200 seconds for sequences of 50 steps, so that on a GPU ours with ``compile`` meets its
 plain code, unless ``--compile-peer`` is given (with ``--length 8`` it takes a minute). Without ManiSkill (which GPU machines
@@ -21,7 +25,10 @@ are of CPU seconds with one thread, and of wall time with more or on a GPU. Prin
 missed.
 
 Sizes: batches of 16 x 50, 7-dimensional actions, a 29-dimensional state beside the images, and the entries of
-:data:`CATEGORICAL`; the numbers of parameters are printed.
+:data:`CATEGORICAL`; the numbers of parameters are printed. sheeprl's sizes are ours. r2dreamer is a DreamerV3 (categorical
+latents, block GRU, RMSNorm, convolutions of stride 1 with pooling, two-hot heads, an actor that learns by REINFORCE, LaProp)
+with our sizes only where its configuration can say them, so its rows inform; :mod:`peers.r2dreamer` lists what differs. They
+are measured on the CPU, without its compiler, in float32, and in the row ``r2dreamer_float16`` with its own autocast.
 """
 
 import argparse
@@ -35,6 +42,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from unittest.mock import patch
 
@@ -67,6 +75,7 @@ class Options(NamedTuple):
     :param steps: of each run of the player
     :param length: of sequences
     :param compile_peer: also its losses
+    :param r2dreamer: folder of its repository, None to leave its rows out
     """
 
     repeats: int
@@ -75,6 +84,7 @@ class Options(NamedTuple):
     steps: int
     length: int = 50
     compile_peer: bool = False
+    r2dreamer: Path | None = None
 
 
 class Pair(NamedTuple):
@@ -253,14 +263,19 @@ def total(turns: list[list[Lap]], first: int, last: int | None = None) -> list[L
 
 
 # ---------------------------------------------------------------------- rows
+def make_dreamer_preset(options: Options, size: int, **switches: bool) -> "Preset":
+    """DreamerV2 for images of ``size`` x ``size``: world model, and actor and critic for the task."""
+    layers = {"cnn_layers": 3 if size == 32 else 4, "sequence_length": options.length}
+    dreamer = {"train_task_behavior": True, "train_exploration_behavior": False}
+    return make_preset("report", **CATEGORICAL, **switches, **layers, **dreamer)
+
+
 def measure_dreamer(options: Options, size: int, cameras: int, target: float, behavior: bool, own: bool = False) -> list[Pair]:
     """World model, and with ``behavior`` imagination with actor and critic."""
     pairs = []
     space = make_space(size, cameras)
     for variant in variants(options):
-        layers = {"cnn_layers": 3 if size == 32 else 4, "sequence_length": options.length}
-        dreamer = {"train_task_behavior": True, "train_exploration_behavior": False}
-        preset = make_preset("report", **CATEGORICAL, **variant.switches, **layers, **dreamer)
+        preset = make_dreamer_preset(options, size, **variant.switches)
         ours, batch = Ours(space, preset, options.device), make_batch(space, (preset.sequence_length, preset.batch_size))
         peer = make_peer(preset, space, own_convolutions=own, **variant.other)
         if not own:
@@ -291,6 +306,22 @@ def measure_model64(options: Options) -> list[Pair]:
 def measure_own64(options: Options) -> list[Pair]:
     """As it comes: convolutions without padding, fewer operations in the encoder and an embedding of 1024 instead of 4096."""
     return measure_dreamer(options, 64, 1, 1.6, behavior=False, own=True) if PEER else []
+
+
+def measure_r2dreamer(options: Options, size: int, cameras: int, float16: bool = False) -> list[Pair]:
+    """World model, actor and critic in one: its losses share a backward pass, so that phases cannot be told apart."""
+    assert options.r2dreamer is not None
+    from peers.r2dreamer import R2Dreamer
+
+    space, preset = make_space(size, cameras), make_dreamer_preset(options, size)
+    ours, batch = Ours(space, preset, "cpu"), make_batch(space, (preset.sequence_length, preset.batch_size))
+    peer = R2Dreamer(options.r2dreamer, asdict(preset), space, ACTION_DIM, float16)
+    what = f"{size}x{size}x{3 * cameras} + state"
+    numbers = ours.parameters()
+    print(f"{what}: parameters (r2dreamer) " + ", ".join(f"{k} {numbers[k]:,} ({n:,})" for k, n in peer.parameters.items()))
+    what = f"full update, {what}, against r2dreamer{' in its float16' if float16 else ''}"
+    turns = take_turns(options, partial(ours.train, batch), partial(peer.train, batch))
+    return [Pair(what, total(mine, 0), total(others, 0), None, threads=threads) for threads, mine, others in turns]
 
 
 def measure_ensemble(options: Options) -> list[Pair]:
@@ -486,6 +517,9 @@ ROWS: dict[str, Callable[[Options], list[Pair]]] = {
     "own64": measure_own64,
     "ensemble": measure_ensemble,
     "latents": measure_latents,
+    "r2dreamer32": partial(measure_r2dreamer, size=32, cameras=2),
+    "r2dreamer64": partial(measure_r2dreamer, size=64, cameras=1),
+    "r2dreamer_float16": partial(measure_r2dreamer, size=32, cameras=2, float16=True),
     "acting": measure_acting,
     "run": measure_run,
 }
@@ -524,26 +558,46 @@ def _seconds(value: float) -> str:
     return f"{value:.2f} s" if value >= 1.0 else f"{1e3 * value:.3g} ms"
 
 
+def check_r2dreamer(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """End with what is wrong where its rows cannot be measured."""
+    path = arguments.r2dreamer
+    if path is None:
+        if needy := [row for row in arguments.rows or () if row.startswith("r2dreamer")]:
+            parser.error(f"--rows {' '.join(needy)}: needs --r2dreamer PATH, a checkout of github.com/NM512/r2dreamer")
+    elif not (path / "dreamer.py").is_file():
+        parser.error(f"--r2dreamer {path}: no dreamer.py there; expected a checkout of github.com/NM512/r2dreamer")
+    elif arguments.device != "cpu":
+        parser.error(f"--r2dreamer is measured on the CPU, not on {arguments.device}: leave one of the two out")
+
+
 def main() -> int:
     """:return: exit status, 1 if a target is missed"""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), help="all, r2dreamer's with its path")
     parser.add_argument("--repeats", type=int, default=5, help="turns of every contestant, after one that warms up")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of torch threads")
     parser.add_argument("--steps", type=int, default=500, help="environment steps of each turn of a run")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--length", type=int, default=50, help="of the sequences in the rows of the world model")
     parser.add_argument("--compile-peer", action="store_true", help="let sheeprl compile, too")
+    parser.add_argument("--r2dreamer", type=Path, metavar="PATH", help="a checkout of NM512/r2dreamer; CPU only")
     arguments = parser.parse_args()
+    check_r2dreamer(parser, arguments)
     threads = arguments.threads if arguments.device == "cpu" else [1]
-    options = Options(arguments.repeats, threads, arguments.device, arguments.steps, arguments.length, arguments.compile_peer)
+    entries = ("repeats", "device", "steps", "length", "compile_peer", "r2dreamer")
+    options = Options(threads=threads, **{entry: getattr(arguments, entry) for entry in entries})
     torch.set_float32_matmul_precision("high")  # sheeprl's default, for both
 
     peer = f"sheeprl {importlib.metadata.version('sheeprl')}" if PEER else "sheeprl is not installed (see --help)"
+    if options.r2dreamer is not None:
+        from peers.r2dreamer import commit
+
+        peer += f", r2dreamer {commit(options.r2dreamer)}"
     where = platform.processor() or platform.machine()
     where = where if options.device == "cpu" else torch.cuda.get_device_name(options.device)
     print(f"Peer: {peer}; torch {torch.__version__}; {where}; medians of {options.repeats} turns\n")
-    pairs = [pair for row in arguments.rows for pair in ROWS[row](options)]
+    known = [row for row in ROWS if options.r2dreamer is not None or not row.startswith("r2dreamer")]
+    pairs = [pair for row in arguments.rows or known for pair in ROWS[row](options)]
     print("\n| measure | threads | CPU ours | other | ratio | wall ours | other | ratio | target | |")
     print("| --- " * 10 + "|")
     met = [print_pair(pair, by_wall=options.device != "cpu") for pair in pairs]
