@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.logger import KVWriter, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -141,18 +142,20 @@ class Run:
         finished, begun = outcome == "finished", self.model.num_timesteps > 0
         if self._progress_bar is not None and hasattr(self._progress_bar, "pbar"):
             self._progress_bar.pbar.close()
-        jobs: list[tuple[str, Callable[[], Any]]] = []
+        models: list[tuple[str, Callable[[], Any]]] = []
         if self.options.keep_models and begun:
-            jobs += [("the model", self._save_model), ("the challenger", self._save_challenger)]
-            jobs += [("the replay buffer", self._save_replay_buffer)]
-        jobs += [("the tables", self.watcher.close), ("the logs", self._close_logs)]
+            models += [("the model", self._save_model), ("the challenger", self._save_challenger)]
+            models += [("the replay buffer", self._save_replay_buffer)]
+        jobs: list[tuple[str, Callable[[], Any]]] = [("the tables", self.watcher.close), ("the logs", self._close_logs)]
         if self.options.pictures and begun:
             jobs += self._drawings()
         if self.options.video and finished:
             jobs.append(("the video", self._film))
         jobs += [("the environments", self.built.env.close), ("the evaluation environment", self.eval_env.close)]
         with self.watcher.stopwatch.section("pictures and saving"):
-            whole = all([_attempt(what, job) for what, job in jobs])
+            whole = all([_attempt(what, job) for what, job in models])
+            for what, job in jobs:
+                _attempt(what, job)
         summary = self.summary = self._summary(outcome)
         if self.options.pictures and begun:
             _attempt("the summary", lambda: summary.write(self.folder))
@@ -262,7 +265,7 @@ def _attempt(what: str, job: Callable[[], Any]) -> bool:
     try:
         job()
         return True
-    except (NotWrittenError, NotFiniteError) as error:
+    except (NotWrittenError, NotFiniteError, ImportError, DependencyNotInstalled) as error:
         print(f"Could not write {what}: {error}", file=sys.stderr, flush=True)
     except Exception:
         print(f"Could not write or close {what}:\n{traceback.format_exc()}", file=sys.stderr, flush=True)

@@ -190,7 +190,8 @@ class Watcher(BaseCallback):
     def _news(self, step: int, outcomes: list[Outcome]) -> str:
         told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
         success = f", success at end {np.mean(told):.0%}" if told else ""
-        left = f", about {self.seconds * (self.spec.steps - step) / step / 60:.1f} min left" if step else ""
+        minutes = self.seconds * max(self.spec.steps - step, 0) / max(step, 1) / 60  # rollouts may go beyond the last step
+        left = f", about {minutes:.1f} min left" if step else ""
         mean = float(np.mean([outcome.episode_return for outcome in outcomes]))
         return f"{self.spec.name}: step {step}/{self.spec.steps}, return {mean:.2f}{success}{left}"
 
