@@ -28,7 +28,7 @@ Sizes: batches of 16 x 50, 7-dimensional actions, a 29-dimensional state beside 
 :data:`CATEGORICAL`; the numbers of parameters are printed. sheeprl's sizes are ours. r2dreamer is a DreamerV3 (categorical
 latents, block GRU, RMSNorm, convolutions of stride 1 with pooling, two-hot heads, an actor that learns by REINFORCE, LaProp)
 with our sizes only where its configuration can say them, so its rows inform; :mod:`peers.r2dreamer` lists what differs. They
-are measured on the CPU, without its compiler, in float32, and in the row ``r2dreamer_float16`` with its own autocast.
+are measured on the CPU, without its compiler and its autocast to float16.
 """
 
 import argparse
@@ -308,18 +308,18 @@ def measure_own64(options: Options) -> list[Pair]:
     return measure_dreamer(options, 64, 1, 1.6, behavior=False, own=True) if PEER else []
 
 
-def measure_r2dreamer(options: Options, size: int, cameras: int, float16: bool = False) -> list[Pair]:
+def measure_r2dreamer(options: Options, size: int, cameras: int) -> list[Pair]:
     """World model, actor and critic in one: its losses share a backward pass, so that phases cannot be told apart."""
     assert options.r2dreamer is not None
     from peers.r2dreamer import R2Dreamer
 
     space, preset = make_space(size, cameras), make_dreamer_preset(options, size)
     ours, batch = Ours(space, preset, "cpu"), make_batch(space, (preset.sequence_length, preset.batch_size))
-    peer = R2Dreamer(options.r2dreamer, asdict(preset), space, ACTION_DIM, float16)
+    peer = R2Dreamer(options.r2dreamer, asdict(preset), space, ACTION_DIM)
     what = f"{size}x{size}x{3 * cameras} + state"
     numbers = ours.parameters()
     print(f"{what}: parameters (r2dreamer) " + ", ".join(f"{k} {numbers[k]:,} ({n:,})" for k, n in peer.parameters.items()))
-    what = f"full update, {what}, against r2dreamer{' in its float16' if float16 else ''}"
+    what = f"full update, {what}, against r2dreamer"
     turns = take_turns(options, partial(ours.train, batch), partial(peer.train, batch))
     return [Pair(what, total(mine, 0), total(others, 0), None, threads=threads) for threads, mine, others in turns]
 
@@ -519,7 +519,6 @@ ROWS: dict[str, Callable[[Options], list[Pair]]] = {
     "latents": measure_latents,
     "r2dreamer32": partial(measure_r2dreamer, size=32, cameras=2),
     "r2dreamer64": partial(measure_r2dreamer, size=64, cameras=1),
-    "r2dreamer_float16": partial(measure_r2dreamer, size=32, cameras=2, float16=True),
     "acting": measure_acting,
     "run": measure_run,
 }

@@ -18,8 +18,8 @@ all cameras. The rest is DreamerV3's and differs from ours, which is DreamerV2's
   16 steps of the prior for 15 of the return; a value loss also on the batch itself; means and deviations for its logs;
 * LaProp with adaptive clipping of each tensor, in place of Adam and clipping of the whole norm.
 
-So the ratio says what an update costs that learns from the same data, not whose code is better. Its autocast is always on, in
-float16, which a CPU may have to emulate: it is off here unless ``float16`` is given.
+So the ratio says what an update costs that learns from the same data, not whose code is better. One thing is exchanged: its
+autocast to float16, which its code always turns on and a CPU may have to emulate, is off.
 """
 
 import importlib
@@ -68,7 +68,6 @@ class R2Dreamer:
     :param preset: sizes, as in :mod:`sb3_cpm.presets`, with categorical latents
     :param observation_space: uint8 images ``(H, W, C)`` of one size and vectors, as our side gets them
     :param action_dim: number of action dimensions
-    :param float16: leave its autocast on
     """
 
     def __init__(
@@ -77,13 +76,11 @@ class R2Dreamer:
         preset: Mapping[str, Any],
         observation_space: spaces.Dict,
         action_dim: int,
-        float16: bool = False,
     ) -> None:
         checkout = checkout.resolve()
         if str(checkout) not in sys.path:
             sys.path.insert(0, str(checkout))
         self.module: Any = importlib.import_module("dreamer")
-        self.float16 = float16
         shapes = {key: space.shape for key, space in observation_space.items() if space.shape}
         self.images = [key for key, shape in shapes.items() if len(shape) == 3]
         self.vectors = [key for key in shapes if key not in self.images]
@@ -162,8 +159,7 @@ class R2Dreamer:
         :param batch: as our side gets it
         :return: one lap, what all of it cost
         """
-        autocast = nullcontext() if self.float16 else patch.object(self.module, "autocast", lambda **kwargs: nullcontext())
-        with autocast:
+        with patch.object(self.module, "autocast", lambda **kwargs: nullcontext()):
             return [timed(lambda: self.agent.update(self._stored(batch)))]
 
 
