@@ -15,7 +15,6 @@ from typing import Any
 from sb3_cpm import __version__
 from sb3_cpm.extras import install_command, needed
 from sb3_cpm.run.settings import TrainSettings, field_documentation
-from sb3_cpm.run.signals import sigterm_raises
 
 EPILOG = """examples:
   python -m sb3_cpm train --agent cpm_sac_quick                 CPM-SAC on PickCube-v1, shortened to an hour without a GPU
@@ -214,6 +213,7 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
         # also what only the runs need: they are counted before anything else is done
         with needed("Experiments", "experiments"):
             from sb3_cpm import experiments
+            from sb3_cpm.run.signals import sigterm_raises
 
             if list or figure is None:
                 print(experiments.listing())

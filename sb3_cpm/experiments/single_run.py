@@ -41,7 +41,7 @@ def perform(spec: RunSpec, results: Path, tell: Callable[[str], None] = lambda n
         other = None if run_folder.has_checkpoint(folder) else find_same_run(spec, config, results)
         if other is not None:
             return RunResult(spec, "skipped", f"taken from {take_over(spec, config, other, results)}", folder)
-        summary = Run(spec, agent, folder, RunOptions(device=device), tell).execute()
+        summary = Run(spec, agent, folder, RunOptions(device=device, player_losses=True), tell).execute()
     return RunResult(spec, "finished", f"{summary.seconds:.0f} s", folder)
 
 

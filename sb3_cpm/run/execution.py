@@ -39,6 +39,8 @@ class RunOptions:
     What a run does that does not change its tables.
 
     :param device: PyTorch device; small networks are fastest on the CPU
+    :param player_losses: log what the player's losses are on trajectories and on challenges, see
+        :mod:`~sb3_cpm.run.player_losses`; each time it rates 512 transitions
     :param keep_models: leave model, challenger and replay buffer behind
     :param pictures: leave learning curve, coefficients and challenge gallery behind, and a summary
     :param video: film an episode at the end
@@ -50,6 +52,7 @@ class RunOptions:
     """
 
     device: str = "cpu"
+    player_losses: bool = False
     keep_models: bool = False
     pictures: bool = False
     video: bool = False
@@ -104,7 +107,9 @@ class Run:
             self.eval_env: VecEnv = self.built.make_eval_env(render=options.video)
             undo.callback(self.eval_env.close)
             run_folder.write_config(folder, run_folder.description(spec, agent))
-            self.watcher = Watcher(spec, folder, self.built, self.eval_env, self.found, tell, options.pictures)
+            self.watcher = Watcher(
+                spec, folder, self.built, self.eval_env, self.found, tell, options.pictures, options.player_losses
+            )
             undo.callback(self.watcher.close)
             undo.pop_all()
         self.setup_seconds = time.perf_counter() - self._started

@@ -41,6 +41,7 @@ class Watcher(BaseCallback):
     :param found: the checkpoint that the model was loaded from
     :param tell: is given a line after each evaluation
     :param with_gallery: whether proposals and coefficients are recorded, where there is a challenger
+    :param with_player_losses: whether the player's losses on trajectories and on challenges are logged
     :raises DamagedRunError: if the tables are not those that belong to the checkpoint
     """
 
@@ -53,8 +54,10 @@ class Watcher(BaseCallback):
         found: Path | None,
         tell: Callable[[str], None] = lambda news: None,
         with_gallery: bool = False,
+        with_player_losses: bool = False,
     ) -> None:
         super().__init__()
+        self.with_player_losses = with_player_losses
         self.spec, self.folder, self.built, self.found, self.tell = spec, folder, built, found, tell
         self.eval_env = eval_env
         self.challenger = next((one for one in built.callbacks if isinstance(one, ChallengerCallback)), None)
@@ -165,7 +168,8 @@ class Watcher(BaseCallback):
     def _dump(self) -> None:
         every = max(self.spec.steps // N_DUMPS, 1)
         self._next_dump = (self.num_timesteps // every + 1) * every
-        log_player_losses(self.model)
+        if self.with_player_losses:
+            log_player_losses(self.model)
         if self.num_timesteps:
             self.model.dump_logs()
         else:
