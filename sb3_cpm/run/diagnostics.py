@@ -18,9 +18,11 @@ class DiagnosticsWriter(KVWriter):
         self.table = table
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        for name, value in sorted(key_values.items()):
-            if not name.startswith("time/") and hasattr(value, "__float__"):
-                self.table.add((step, name, float(value)))
+        self.table.add_all(
+            (step, name, float(value))
+            for name, value in sorted(key_values.items())
+            if not name.startswith("time/") and hasattr(value, "__float__")
+        )
 
     def close(self) -> None:
         self.table.close()

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +43,19 @@ class Table:
         self.path, self.columns = path, tuple(columns)
         self._file = GrowingFile(path, size, digest)
         if size == 0:
-            self._write(self.columns)
+            self._write([self.columns])
 
     def add(self, row: Sequence[Any]) -> None:
         """:param row: one value per column; None becomes an empty cell, a bool 0 or 1"""
-        self._write([_cell(value) for value in row])
+        self.add_all([row])
 
-    def _write(self, cells: Sequence[Any]) -> None:
+    def add_all(self, rows: Iterable[Sequence[Any]]) -> None:
+        """:param rows: as for :meth:`add`; they come to the disk together"""
+        self._write([[_cell(value) for value in row] for row in rows])
+
+    def _write(self, rows: Iterable[Sequence[Any]]) -> None:
         text = io.StringIO()
-        csv.writer(text).writerow(cells)
+        csv.writer(text).writerows(rows)
         self._file.append(text.getvalue())
 
     def state(self) -> dict[str, Any]:
@@ -86,7 +90,7 @@ class GrownTable(Table):
         """:param row: by column"""
         if not self.columns:
             self.columns = tuple(row)
-            self._write(self.columns)
+            self._write([self.columns])
         self.add([row[column] for column in self.columns])
 
 
