@@ -191,6 +191,7 @@ def test_d_stores_what_was_executed():
     np.testing.assert_allclose(stored, np.array(env.executed), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_same_seed_same_run_and_another_seed_another():
     def run(seed):
         model = make_model(toy(("camera", "state")), policy=PointNetPolicy, seed=seed, buffer_kwargs=LENIENT)

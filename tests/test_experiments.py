@@ -388,6 +388,7 @@ def tiny_experiment(monkeypatch):
     return experiment
 
 
+@pytest.mark.slow
 def test_from_nothing_to_figure_and_table(tmp_path, tiny_experiment):
     results = run_experiment("tiny", "full", results=tmp_path, jobs=0, tell=lambda line: None)
     assert [result.outcome for result in results] == ["finished"] * 4

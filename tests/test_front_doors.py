@@ -131,7 +131,10 @@ def wait_for_episodes(folder: Path, n: int) -> None:
 
 @pytest.mark.parametrize(
     ("number", "n_envs"),
-    [(signal.SIGTERM, 1), pytest.param(signal.SIGKILL, 1, marks=pytest.mark.slow), (signal.SIGTERM, 2)],
+    [
+        (signal.SIGTERM, 1),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((signal.SIGKILL, 1), (signal.SIGTERM, 2))),
+    ],
 )
 def test_a_run_that_was_cut_off_goes_on(number: signal.Signals, n_envs: int, tmp_path: Path) -> None:
     train(run_folder=str(tmp_path / "unbroken"), n_envs=n_envs, **SMALL)
@@ -151,6 +154,7 @@ def test_a_run_that_was_cut_off_goes_on(number: signal.Signals, n_envs: int, tmp
     assert not (folder / "checkpoint").exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_its_first_episode_ended_goes_on(tmp_path: Path) -> None:
     process = start(tmp_path / "run", tmp_path, evaluations=0)
     while not (tmp_path / "run" / "config.yml").exists():

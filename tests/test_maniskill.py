@@ -360,6 +360,7 @@ def test_a_task_without_goal_and_with_a_new_scene_every_episode() -> None:
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_vector_environments_agree(env: ManiSkillEnv) -> None:
     factory = partial(make_maniskill_env, "PickCube-v1")

@@ -378,6 +378,7 @@ class KillsAt(BaseCallback):
         return True
 
 
+@pytest.mark.slow
 def test_a_training_run_goes_on_without_a_worker_that_died(tmp_path: Path) -> None:
     killer = KillsAt(130)
     with pytest.warns(UserWarning, match=r"Worker 1 died with exit code -9"):

@@ -263,6 +263,7 @@ def test_module_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         train(env="brings_no_task:Brought-v0")
 
 
+@pytest.mark.slow
 def test_two_processes_and_tqc(tmp_path: Path) -> None:
     changes = {"n_envs": 2, "agent": "cpm_tqc", "steps": 300, "evaluations": 0, "video": False}
     summary = train(run_folder=str(tmp_path / "run"), **{**SMALL, **changes})

@@ -439,6 +439,7 @@ def test_sb3_trains_on_every_kind_of_observation(algorithm: type[BaseAlgorithm],
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.maniskill
 def test_stock_worker_processes() -> None:
     env = make_vec_env(
