@@ -1,6 +1,7 @@
 """K networks computed as one, and how much they disagree (Lakshminarayanan et al. 2017; Pathak et al. 2019, eq. 1)."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -8,7 +9,9 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_cpm.uncertainty.base import Transitions
 from sb3_cpm.uncertainty.heads import Disagreement, Predictions, Rating
+from sb3_cpm.uncertainty.scale import ScaledUncertainty, some_of
 from sb3_cpm.world_model.fast.acceleration import is_plain
 from sb3_cpm.world_model.fast.activation import elu_
 from sb3_cpm.world_model.fast.linear import is_large
@@ -116,3 +119,41 @@ def ensemble_loss(predictions: Sequence[th.Tensor] | th.Tensor, targets: th.Tens
     else:  # on a GPU launching operations is what takes time
         errors = [0.5 * F.mse_loss(one, targets, reduction="sum") for one in predictions]
     return th.stack(errors).sum() / len(targets)
+
+
+class EnsembleUncertainty(ScaledUncertainty):
+    """
+    What measures of disagreement have in common: what the heads predicted of a batch while they learnt from it says how they
+    disagree about it, without a further prediction.
+    """
+
+    ensemble: Ensemble
+    #: latents of the batch learnt from last, and d of some of its transitions
+    _rated: tuple[th.Tensor | None, th.Tensor | None] = None, None
+
+    @abstractmethod
+    def inputs(self, transitions: Transitions) -> th.Tensor:
+        """What the heads read, shape ``(*batch, input_dim)``."""
+
+    def predict(self, transitions: Transitions) -> list[th.Tensor]:
+        """Predictions of all heads, each of shape ``(*batch, output_dim)``."""
+        return self.ensemble.predictions(self.inputs(transitions))
+
+    def raw(self, transitions: Transitions) -> th.Tensor:
+        """d: standard deviation over the heads, averaged over the output's dimensions, shape ``(*batch,)``, at least 0."""
+        return self.ensemble.disagreement(self.inputs(transitions))
+
+    def remember(self, transitions: Transitions, predictions: Sequence[th.Tensor]) -> None:
+        """
+        :param transitions: a batch to learn from, batch dimension ``(n,)``
+        :param predictions: of each head, shape ``(n, output_dim)``
+        """
+        with th.no_grad():
+            rows = some_of(len(transitions.feat))
+            self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
+
+    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
+        """Of the transitions learnt from last, as the heads predicted then."""
+        feat, raw = self._rated
+        self._rated = None, None
+        return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)

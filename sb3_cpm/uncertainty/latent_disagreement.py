@@ -10,15 +10,15 @@ from typing import Any
 import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
-from sb3_cpm.uncertainty.scale import ExpScale, ScaledUncertainty, some_of
+from sb3_cpm.uncertainty.ensemble import Ensemble, EnsembleUncertainty, ensemble_loss
+from sb3_cpm.uncertainty.scale import ExpScale
 
 __all__ = ["TARGETS", "Ensemble", "ExpScale", "LatentDisagreement"]
 
 TARGETS = ("feat", "stoch", "deter", "embed")
 
 
-class LatentDisagreement(ScaledUncertainty):
+class LatentDisagreement(EnsembleUncertainty):
     """
     In imagination it computes exactly what it computes on real transitions: a disagreement needs no outcome.
 
@@ -47,34 +47,14 @@ class LatentDisagreement(ScaledUncertainty):
         self.target = target
         output_dim = {"feat": sizes.feat, "stoch": sizes.stoch, "deter": sizes.deter, "embed": sizes.embed}[target]
         self.ensemble = Ensemble(heads, sizes.feat + sizes.action, output_dim, layers, units, sizes.one_hot)
-        self._rated: tuple[th.Tensor | None, th.Tensor | None] = None, None
 
-    def predict(self, transitions: Transitions) -> list[th.Tensor]:
-        """Predictions of all heads, each of shape ``(*batch, target_dim)``."""
-        return self.ensemble.predictions(self._inputs(transitions))
-
-    def disagreement(self, transitions: Transitions) -> th.Tensor:
-        """d: standard deviation over the heads, averaged over the target's dimensions, shape ``(*batch,)``, at least 0."""
-        return self.ensemble.disagreement(self._inputs(transitions))
-
-    def _inputs(self, transitions: Transitions) -> th.Tensor:
+    def inputs(self, transitions: Transitions) -> th.Tensor:
         return th.cat((transitions.feat, transitions.action), dim=-1)
-
-    def raw(self, transitions: Transitions) -> th.Tensor:
-        return self.disagreement(transitions)
 
     def loss(self, transitions: Transitions) -> th.Tensor:
         predictions = self.predict(transitions)
-        with th.no_grad():
-            rows = some_of(len(transitions.feat))
-            self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
+        self.remember(transitions, predictions)
         return ensemble_loss(predictions, self.targets(transitions))
-
-    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
-        """Of the transitions learnt from last, as the heads predicted then: that needs no further prediction."""
-        feat, raw = self._rated
-        self._rated = None, None
-        return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
 
     def targets(self, transitions: Transitions) -> th.Tensor:
         """What the heads shall predict, shape ``(*batch, target_dim)``."""

@@ -17,12 +17,11 @@ from typing import Any
 import torch as th
 
 from sb3_cpm.uncertainty.base import LatentSizes, Transitions
-from sb3_cpm.uncertainty.ensemble import Ensemble, disagreement, ensemble_loss
+from sb3_cpm.uncertainty.ensemble import Ensemble, EnsembleUncertainty, ensemble_loss
 from sb3_cpm.uncertainty.parts import DreamtEmbedding
-from sb3_cpm.uncertainty.scale import ScaledUncertainty, some_of
 
 
-class ObservationEnsemble(ScaledUncertainty):
+class ObservationEnsemble(EnsembleUncertainty):
     """
     :param sizes: sizes of latents and actions
     :param heads: K
@@ -47,16 +46,8 @@ class ObservationEnsemble(ScaledUncertainty):
         self.register_buffer("rotation", rotation)  # (sizes.embed, dims), orthonormal columns
         self.dream = DreamtEmbedding(sizes.feat, embed, units)
         self.ensemble = Ensemble(heads, embed + sizes.action, embed, layers, units)
-        self._rated: tuple[th.Tensor | None, th.Tensor | None] = None, None
 
-    def predict(self, transitions: Transitions) -> list[th.Tensor]:
-        """Predicted standardised embeddings of all heads, each of shape ``(*batch, dims)``."""
-        return self.ensemble.predictions(self._inputs(transitions))
-
-    def raw(self, transitions: Transitions) -> th.Tensor:
-        return self.ensemble.disagreement(self._inputs(transitions))
-
-    def _inputs(self, transitions: Transitions) -> th.Tensor:
+    def inputs(self, transitions: Transitions) -> th.Tensor:
         embed = None if transitions.embed is None else self._projected(transitions.embed)
         return th.cat((self.dream(transitions.feat, embed), transitions.action), dim=-1)
 
@@ -71,16 +62,8 @@ class ObservationEnsemble(ScaledUncertainty):
         assert transitions.embed is not None and transitions.next_embed is not None, "only real transitions have embeddings"
         embed, targets = (self.dream.norm(self._projected(one)) for one in (transitions.embed, transitions.next_embed))
         predictions = self.ensemble.predictions(th.cat((embed, transitions.action), dim=-1))
-        with th.no_grad():
-            rows = some_of(len(embed))
-            self._rated = transitions.feat, disagreement([one[rows] for one in predictions])
+        self.remember(transitions, predictions)
         return ensemble_loss(predictions, targets) + self.dream.loss(transitions.feat, embed)
-
-    def raw_of_some(self, transitions: Transitions) -> th.Tensor:
-        """Of the transitions learnt from last, as the heads predicted then: that needs no further prediction."""
-        feat, raw = self._rated
-        self._rated = None, None
-        return raw if feat is transitions.feat and raw is not None else super().raw_of_some(transitions)
 
     @th.no_grad()
     def adapt(self, transitions: Transitions) -> dict[str, th.Tensor]:
