@@ -16,17 +16,11 @@ def misspelt_names_told(settings: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     except TypeError as error:
-        name = unexpected_argument(error)
+        refused = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         for setting, given in settings.items():
-            if name is not None and isinstance(given, Mapping) and name in _names(given):
-                raise ValueError(f"{setting}: unknown name {name!r} ({error})") from error
+            if refused is not None and isinstance(given, Mapping) and refused[1] in _names(given):
+                raise ValueError(f"{setting}: unknown name {refused[1]!r} ({error})") from error
         raise
-
-
-def unexpected_argument(error: TypeError) -> str | None:
-    """:return: the argument that a call has refused, None for other errors"""
-    found = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-    return None if found is None else found[1]
 
 
 def _names(given: Mapping[str, Any]) -> set[str]:

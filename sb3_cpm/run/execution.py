@@ -138,7 +138,7 @@ class Run:
         return self._progress_bar
 
     def _outputs(self) -> list[KVWriter]:
-        return [_patient_log("tensorboard", self.folder / "tensorboard")] if self.options.tensorboard else []
+        return [_tensorboard(self.folder / "tensorboard")] if self.options.tensorboard else []
 
     # ------------------------------------------------------------------ what is left behind
 
@@ -277,14 +277,13 @@ def _attempt(what: str, job: Callable[[], Any]) -> bool:
     return False
 
 
-def _patient_log(kind: str, folder: Path) -> KVWriter:
+def _tensorboard(folder: Path) -> KVWriter:
     """
-    :param kind: "csv" or "tensorboard"
     :param folder: where it goes
     :return: SB3's writer, which a full disk does not end the run by
     """
     with disk_errors_named(folder):
-        output = make_output_format(kind, str(folder))
+        output = make_output_format("tensorboard", str(folder))
     write, told = output.write, False
 
     def attempt(*args: Any) -> None:

@@ -15,7 +15,7 @@ from sb3_cpm.agents import Built
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import DamagedFileError, DamagedRunError, NotFiniteError, NotWrittenError
 from sb3_cpm.run.diagnostics import DiagnosticsWriter
-from sb3_cpm.run.evaluation import Outcome, evaluate, success_of
+from sb3_cpm.run.evaluation import evaluate, success_of
 from sb3_cpm.run.player_losses import log_player_losses
 from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.specification import RunSpec
@@ -183,21 +183,21 @@ class Watcher(BaseCallback):
         spec, step = self.spec, self.built.model.num_timesteps
         with self.stopwatch.section("evaluation"):
             outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes, spec.eval_seed)
-        self.logger.record("eval/mean_reward", float(np.mean([outcome.episode_return for outcome in outcomes])))
+        mean_return = float(np.mean([outcome.episode_return for outcome in outcomes]))
         told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
-        if told:
-            self.logger.record("eval/success_rate", float(np.mean(told)))
+        success = float(np.mean(told)) if told else None
+        self.logger.record("eval/mean_reward", mean_return)
+        if success is not None:
+            self.logger.record("eval/success_rate", success)
         for index, outcome in enumerate(outcomes):
             self.tables["evaluations"].add((spec.experiment, spec.agent, spec.env, spec.seed, step, index, *outcome))
-        self.tell(self._news(step, outcomes))
+        self.tell(self._news(step, mean_return, success))
 
-    def _news(self, step: int, outcomes: list[Outcome]) -> str:
-        told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
-        success = f", success at end {np.mean(told):.0%}" if told else ""
+    def _news(self, step: int, mean_return: float, success: float | None) -> str:
+        told = "" if success is None else f", success at end {success:.0%}"
         minutes = self.seconds * max(self.spec.steps - step, 0) / max(step, 1) / 60  # rollouts may go beyond the last step
         left = f", about {minutes:.1f} min left" if step else ""
-        mean = float(np.mean([outcome.episode_return for outcome in outcomes]))
-        return f"{self.spec.name}: step {step}/{self.spec.steps}, return {mean:.2f}{success}{left}"
+        return f"{self.spec.name}: step {step}/{self.spec.steps}, return {mean_return:.2f}{told}{left}"
 
     def _save(self) -> None:
         try:
