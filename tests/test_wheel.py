@@ -169,10 +169,22 @@ def test_the_readme_of_an_index_has_no_link_that_leads_nowhere(wheel: Path) -> N
     assert "](https://" in text and not re.findall(r"\]\((?!https://)[^)]*\)", text)
 
 
-def test_links_of_the_readme() -> None:
+@pytest.mark.parametrize(
+    "page", ["README.md", "notebooks/README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+)
+def test_links_lead_somewhere(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\((?!https?://)([^)\s]+)\)", text):
+        name, _, anchor = target.partition("#")
+        file = (ROOT / page).parent / name if name else ROOT / page
+        assert file.exists(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}, target
+
+
+def test_the_readme_of_an_index_has_absolute_links() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    relative = re.findall(r"\]\((?!https://|#)([^)]+)\)", text)
-    assert relative and not [target for target in relative if not (ROOT / target.partition("#")[0]).exists()]
     readme = runpy.run_path(str(ROOT / "setup.py"), run_name="setup")["readme"]
     assert not re.findall(r"\]\((?!https://)", readme(text, "https://example.org/sb3_cpm"))
     picture = readme("![a picture](docs/a.png) of [that](docs/a.md), [see](#below), [SB3](https://sb3.org)", "https://e.org/c")
