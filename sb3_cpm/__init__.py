@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_cpm.buffers import CPMBuffer
     from sb3_cpm.callbacks import ChallengerCallback
+    from sb3_cpm.challenge_env import ChallengeVecEnv
     from sb3_cpm.checkpoint_callback import CheckpointCPMCallback, resume
     from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 
@@ -33,6 +34,7 @@ __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 __all__ = [
     "CPMBuffer",
+    "ChallengeVecEnv",
     "ChallengerCallback",
     "CheckpointCPMCallback",
     "PointNetExtractor",
@@ -43,6 +45,7 @@ __all__ = [
 
 _HOMES = {
     "CPMBuffer": "sb3_cpm.buffers",
+    "ChallengeVecEnv": "sb3_cpm.challenge_env",
     "ChallengerCallback": "sb3_cpm.callbacks",
     "CheckpointCPMCallback": "sb3_cpm.checkpoint_callback",
     "PointNetExtractor": "sb3_cpm.extractors",

@@ -88,6 +88,9 @@ class CPMBuffer(EpisodeBuffer):
     :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
     :param player_keys: observation keys that batches for P hold. None: all keys, unless P's features extractor names
         those that it reads (``PointNetExtractor`` does), which the callback then passes on
+    :param challenge_keys: keys that make the goal of a challenge, where a
+        :class:`~sb3_cpm.challenge_env.ChallengeVecEnv` adds ``"challenge"`` to the observations: rows then tell P which
+        challenge they are of; None: those that the environment names
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
@@ -121,6 +124,7 @@ class CPMBuffer(EpisodeBuffer):
         storage_dtypes: dict[str, StorageSpec] | None = None,
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
+        challenge_keys: Sequence[str] | None = None,
     ):
         given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_buffer_arguments(
@@ -141,6 +145,7 @@ class CPMBuffer(EpisodeBuffer):
             storage_dtypes=storage_dtypes,
             memmap_dir=memmap_dir,
             player_keys=player_keys,
+            challenge_keys=challenge_keys,
         )
         self._given = given
         self.challenge_ratio = challenge_ratio
@@ -294,9 +299,10 @@ class CPMBuffer(EpisodeBuffer):
         rows, envs = self.books.draw(n_original, n_virtual)
         if not n_imaginary:
             return self._read(rows, envs, n_virtual, env)
-        imaginary_rows, imaginary_envs, rewards, is_goal = self._imaginary.sample(n_imaginary, self.n_added)
-        rows, envs = np.concatenate([rows, imaginary_rows]), np.concatenate([envs, imaginary_envs])
-        return self._read(rows, envs, n_virtual, env, rewards, is_goal if self.terminal_goals else None)
+        drawn = self._imaginary.sample(n_imaginary, self.n_added)
+        rows, envs = np.concatenate([rows, drawn.slots]), np.concatenate([envs, drawn.envs])
+        goals = None if self.challenge_keys is None else self.ring.locate(drawn.goal_slots, drawn.envs)
+        return self._read(rows, envs, n_virtual, env, drawn.rewards, drawn.is_goal if self.terminal_goals else None, goals)
 
     # ------------------------------------------------------------------ sequences for C
 
@@ -428,6 +434,7 @@ class CPMBuffer(EpisodeBuffer):
             goal_selection_strategy=self.goal_selection_strategy,
             storage_dtypes=self.storage_dtypes,
             memmap_dir=self.memmap_dir,
+            challenge_keys=self.challenge_keys,
         )
         if earlier is not None:
             for row in range(n_earlier):

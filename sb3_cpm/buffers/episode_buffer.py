@@ -44,6 +44,7 @@ from sb3_cpm.buffers.sequences import draw_starts, read_sequences
 from sb3_cpm.buffers.storage import Episode, Locations, NextObservationView, ObservationRing
 from sb3_cpm.files import Archive, DamagedFileError, write_archive
 from sb3_cpm.packing import pack, unpack
+from sb3_cpm.spaces import CHALLENGE
 from sb3_cpm.type_aliases import SequenceBatch
 
 #: Changes whenever a buffer of an earlier release could be misread: of one that was pickled, and of one in a file of ours.
@@ -83,6 +84,9 @@ class EpisodeBuffer(HerReplayBuffer):
         Batches hold the space's dtype as ever
     :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
     :param player_keys: observation keys that batches hold; None: all keys
+    :param challenge_keys: keys that make the goal of a challenge, where a
+        :class:`~sb3_cpm.challenge_env.ChallengeVecEnv` adds ``"challenge"`` to the observations; None: those that the
+        environment names
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
@@ -102,7 +106,10 @@ class EpisodeBuffer(HerReplayBuffer):
         storage_dtypes: dict[str, StorageSpec] | None = None,
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
+        challenge_keys: Sequence[str] | None = None,
     ):
+        if challenge_keys is None:
+            challenge_keys = getattr(env, "challenge_keys", None)
         self._given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_spaces(observation_space, n_sampled_goal, player_keys)
         check_player_reads_images(observation_space)
@@ -125,6 +132,8 @@ class EpisodeBuffer(HerReplayBuffer):
         self.storage_dtypes = storage_dtypes
         self.memmap_dir = memmap_dir
         self.player_keys = None if player_keys is None else tuple(player_keys)
+        #: Keys that the goal of a challenge consists of; None where P is not told which challenge it plays.
+        self.challenge_keys = None if challenge_keys is None else tuple(challenge_keys)
         self._allocate()
 
     # ------------------------------------------------------------------ storage
@@ -133,7 +142,10 @@ class EpisodeBuffer(HerReplayBuffer):
         """Arrays for ``buffer_size`` transitions per environment, and empty books."""
         shape = (self.buffer_size, self.n_envs)
         assert isinstance(self.obs_shape, dict)
-        codecs = make_codecs(self.observation_space, self.obs_shape, self.storage_dtypes)
+        shapes = dict(self.obs_shape)
+        if self.challenge_keys is not None:  # follows from where a row is drawn from, and is never stored
+            del shapes[CHALLENGE]
+        codecs = make_codecs(self.observation_space, shapes, self.storage_dtypes)
         n_slots = self.buffer_size * self.n_envs
         n_bytes = {key: codec.nbytes * n_slots for key, codec in codecs.items()}
         in_files = 0 if self.memmap_dir is None else sum(n_bytes.values())
@@ -309,6 +321,7 @@ class EpisodeBuffer(HerReplayBuffer):
         env: VecNormalize | None = None,
         last_rewards: np.ndarray | None = None,
         last_is_goal: np.ndarray | None = None,
+        last_goals: Locations | None = None,
     ) -> DictReplayBufferSamples:
         """
         :param rows: slots of transitions, shape ``(n,)``
@@ -317,11 +330,12 @@ class EpisodeBuffer(HerReplayBuffer):
         :param env: normalizes observations and rewards
         :param last_rewards: rewards instead of the task's, for the last transitions
         :param last_is_goal: which of these end here
+        :param last_goals: the transitions that lead to the goals of the last ones' challenges
         """
         wanted = self._keys_for_player()
         at = self.ring.locate(rows, envs)
         # VecNormalize wants all the keys that it normalizes, hindsight the goals, whether P reads them or not
-        keys = wanted if env is None and not n_virtual else tuple(self.observations)
+        keys = [key for key in wanted if key in self.observations] if env is None and not n_virtual else self.observations
         obs: Any = {key: self.ring.read(key, at) for key in keys}
         next_obs: Any = {key: self.ring.read_next(key, at) for key in keys}
         outcomes = self._outcomes.reshape(-1, 3).take(at.here, axis=0)
@@ -340,6 +354,8 @@ class EpisodeBuffer(HerReplayBuffer):
         if env is not None:
             obs, next_obs = env.normalize_obs(obs), env.normalize_obs(next_obs)
             rewards = self._normalize_reward(rewards, env)
+        if self.challenge_keys is not None and CHALLENGE in wanted:
+            obs[CHALLENGE] = next_obs[CHALLENGE] = self._challenges_of(len(rows), last_goals, env)
         tensor = self._tensor
         return DictReplayBufferSamples(
             observations={key: tensor(obs[key]) for key in wanted},
@@ -348,6 +364,27 @@ class EpisodeBuffer(HerReplayBuffer):
             dones=tensor(dones),
             rewards=tensor(np.ascontiguousarray(rewards)),
         )
+
+    def _challenges_of(self, n: int, last_goals: Locations | None, env: VecNormalize | None) -> np.ndarray:
+        """
+        :param n: number of rows, of which the last ones are of challenges
+        :param last_goals: the transitions that lead to their goals
+        :param env: normalizes observations
+        :return: flag and goal, zeros for rows of the task, shape ``(n, 1 + goal_dim)``
+        """
+        assert self.challenge_keys is not None
+        shape = self.observation_space[CHALLENGE].shape
+        assert shape is not None
+        challenges = np.zeros((n, *shape), np.float32)
+        if last_goals is not None:
+            keys = self.challenge_keys if env is None else self.observations
+            goals: Any = {key: self.ring.read_next(key, last_goals) for key in keys}
+            if env is not None:
+                goals = env.normalize_obs(goals)
+            of_challenges = challenges[n - len(last_goals.here) :]
+            of_challenges[:, 0] = 1
+            np.concatenate([goals[key] for key in self.challenge_keys], axis=1, out=of_challenges[:, 1:], casting="same_kind")
+        return challenges
 
     def _tensor(self, fresh: np.ndarray) -> th.Tensor:
         """On P's device, sharing the memory of an array that is nobody else's."""
@@ -397,7 +434,7 @@ class EpisodeBuffer(HerReplayBuffer):
         return self._read(batch_indices, env_indices, len(batch_indices), env)
 
     def _keys_for_player(self) -> tuple[str, ...]:
-        return tuple(self.observations) if self.player_keys is None else self.player_keys
+        return tuple(self.observation_space.spaces) if self.player_keys is None else self.player_keys
 
     # ------------------------------------------------------------------ sequences for C, episodes
 

@@ -7,7 +7,7 @@ A challenge holds positions in D, rewards of its own and what it was chosen for,
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -143,19 +143,18 @@ class ImaginaryBuffer:
         """:return: the challenges, oldest first, their ages filled in"""
         return [replace(challenge, age=now - challenge.rewarded_at) for challenge in self._challenges]
 
-    def sample(self, n: int, now: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def sample(self, n: int, now: int) -> "ImaginaryRows":
         """
         :param n: number of transitions, drawn uniformly over all transitions of all challenges
         :param now: number of transitions that D has been given, for the ages
-        :return: slots, environments, rewards, and whether it leads to the goal, each of shape ``(n,)``
         """
         if self._index is None:
             self._index = _Index.of(self._challenges, self.buffer_size)
         index = self._index
-        picks = np.random.randint(len(index.slots), size=n)
+        picks = np.random.randint(len(index.rewarded_at), size=n)
         self._age_sum += now - float(index.rewarded_at.take(picks).mean())
         self._age_samples += 1
-        return index.slots.take(picks), index.envs.take(picks), index.rewards.take(picks), index.is_goal.take(picks)
+        return ImaginaryRows(*(column.take(picks) for column in index.rows))
 
     def state(self) -> dict[str, Any]:
         """All that it holds, for :meth:`restore`."""
@@ -176,14 +175,29 @@ class ImaginaryBuffer:
         return age
 
 
-@dataclass(frozen=True)
-class _Index:
-    """All transitions of I one after another, each array of shape ``(transitions in I,)``."""
+class ImaginaryRows(NamedTuple):
+    """
+    Transitions of challenges, each array of shape ``(n,)``.
+
+    :param slots: where they are in D
+    :param envs: their environments
+    :param rewards: their artificial rewards
+    :param is_goal: whether they lead to the goal
+    :param goal_slots: of the transitions that lead to the goals of their challenges
+    """
 
     slots: np.ndarray
     envs: np.ndarray
     rewards: np.ndarray
     is_goal: np.ndarray
+    goal_slots: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Index:
+    """All transitions of I one after another, and when each was rewarded, shape ``(transitions in I,)``."""
+
+    rows: ImaginaryRows
     rewarded_at: np.ndarray
 
     @classmethod
@@ -197,7 +211,9 @@ class _Index:
                     np.full(len(steps), challenge.environment),
                     challenge.rewards.astype(np.float32),
                     steps == challenge.goal,
+                    np.full(len(steps), (challenge.episode.start + challenge.goal) % buffer_size),
                     np.full(len(steps), challenge.rewarded_at),
                 )
             )
-        return cls(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+        *rows, rewarded_at = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        return cls(ImaginaryRows(*rows), rewarded_at)

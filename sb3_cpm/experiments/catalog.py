@@ -112,10 +112,12 @@ DECAYS = tuple(
 )
 NO_CHALLENGES = Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}})
 WEAK = Contender("CPM, weak challenges", "cpm_sac", {"replay_buffer_kwargs": CHALLENGES["tuned"]})
+CONDITIONED = Contender("CPM, told its challenge", "cpm_sac", {"vec_env_wrapper": "sb3_cpm.ChallengeVecEnv"})
 #: What of the method helps or hurts where the report's constants do badly.
 PARTS = (
     SAC,
     CPM,
+    CONDITIONED,
     Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
     NO_CHALLENGES,
     WEAK,
