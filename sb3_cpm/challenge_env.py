@@ -15,9 +15,9 @@ from sb3_cpm.spaces import CHALLENGE, is_vector
 
 class ChallengeVecEnv(VecEnvWrapper):
     """
-    Adds the key ``"challenge"`` to Dict observations: whether a challenge is posed, and its goal (report, 2.3 and 3.1: the goal
-    has to be a part of the policy's input). A challenge's rewards are not the task's, and a player that cannot tell the two
-    apart takes one for the other.
+    Adds the key ``"challenge"`` to Dict observations: whether a challenge is posed, and its goal (report, 2.3 and 3.1: the
+    goal has to be a part of the policy's input). A challenge's rewards are not the task's, and a player that cannot tell the
+    two apart takes one for the other.
 
     In the environment no challenge is posed: the key is all zeros, and the player plays the task. In the batches of a
     :class:`~sb3_cpm.buffers.CPMBuffer` whose environment has this wrapper, rows of a challenge have 1 and the goal: the vector
@@ -110,7 +110,7 @@ def check_outermost(venv: VecEnv | None) -> None:
     while isinstance(inner, VecEnvWrapper):
         if isinstance(inner, VecNormalize) and inner.norm_obs and CHALLENGE in (inner.norm_obs_keys or ()):
             raise ValueError(
-                "VecNormalize is around ChallengeVecEnv, and sees nothing but zeros for challenges: put ChallengeVecEnv around "
-                "VecNormalize."
+                "VecNormalize is around ChallengeVecEnv, and sees nothing but zeros for challenges: put ChallengeVecEnv "
+                "around VecNormalize."
             )
         inner = inner.venv
