@@ -7,8 +7,9 @@ Does the player learn from a goal that was found once? On PointMaze_Medium-v3, f
 
 25 episodes of pink noise (two of which meet the goal) and one that a controller drives there are put into a buffer, and SAC
 learns from it for 7,500 updates without acting. Then, along the driven episode: the critics' smaller value of what was done
-there, so many steps before the goal, beside gamma to the power of the steps, which it should be; the cosine between the policy's
-actions and those that led to the goal; and whether the policy gets there. ``--copies`` puts the driven episode in several times.
+there, so many steps before the goal, beside gamma to the power of the steps, which it should be; the cosine between the
+policy's actions and those that led to the goal; and whether the policy gets there. ``--copies`` puts the driven episode in
+several times.
 About a minute per row.
 """
 
