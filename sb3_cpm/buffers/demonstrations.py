@@ -39,12 +39,14 @@ class Demonstration:
     :param actions: in the environment's units, shape ``(T, *action_shape)``; clipped to the environment's bounds
     :param rewards: shape ``(T,)``
     :param terminated: the environment ended the episode itself; if not, it was cut off and the critic bootstraps
+    :param instance: which object it was about, as the environment's ``info["instance"]`` names it; None if it names none
     """
 
     observations: dict[str, np.ndarray]
     actions: np.ndarray
     rewards: np.ndarray
     terminated: bool = False
+    instance: str | None = None
 
 
 def read_demonstrations(
