@@ -11,7 +11,6 @@ Of its files only ``model.zip``, which is SB3's own, can execute code when it is
 
 import os
 import shutil
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cpm.buffers import CPMBuffer, EpisodeBuffer
 from sb3_cpm.callbacks import ChallengerCallback
@@ -43,6 +41,7 @@ from sb3_cpm.files import (
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.randomness import random_state
 from sb3_cpm.seeds import FIRST_SEED
+from sb3_cpm.training_env import begin_episodes
 
 NAME = "checkpoint"
 MODEL, BUFFER, STATE = "model.zip", "replay_buffer.npz", "state.npz"
@@ -324,37 +323,3 @@ def seed_at(step: int, seed: int, n_envs: int) -> int:
     """:return: the seed of what comes after a checkpoint at this step, one of those that evaluation does not have"""
     words = np.random.SeedSequence([seed, step]).generate_state(1)
     return int(words[0]) % (FIRST_SEED - n_envs)
-
-
-def begin_episodes(model: BaseAlgorithm, env: VecEnv | None = None, counted: bool = False) -> None:
-    """
-    End the episodes that go on in the model's buffer, and begin new ones, from which the next ``learn(...,
-    reset_num_timesteps=False)`` goes on.
-
-    :param model: between two rollouts
-    :param env: the environments, as the rollouts see them; None: ``model.env``
-    :param counted: whether a VecNormalize counts the first observations, as it does with those of other episodes. It must not
-        where this is done once more, or already was
-    """
-    env = model.env if env is None else env
-    assert env is not None
-    buffer = getattr(model, "replay_buffer", None)
-    if isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it is cut is what we want
-            buffer.truncate_last_trajectory()
-    noise = getattr(model, "action_noise", None)
-    if noise is not None:
-        noise.reset()
-    normalize = model.get_vec_normalize_env()
-    counts = normalize is not None and normalize.training
-    if normalize is not None:
-        normalize.training = counts and counted
-    try:
-        model._last_obs = env.reset()  # type: ignore[assignment]
-    finally:
-        if normalize is not None:
-            normalize.training = counts
-    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
-    if normalize is not None:
-        model._last_original_obs = normalize.get_original_obs()

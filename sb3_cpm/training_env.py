@@ -7,12 +7,15 @@ What SB3 loses or does not notice of the training environment while a rollout is
   and beside a VecNormalize it asks only after the callbacks for what the last step gave.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_cpm.buffers.episode_buffer import NEXT_OBSERVATION, REWARD
 
@@ -143,3 +146,37 @@ class WatchedVecEnv(VecEnvWrapper):
             return self.venv.step_wait()
         finally:
             normalize.venv = inner
+
+
+def begin_episodes(model: BaseAlgorithm, env: VecEnv | None = None, counted: bool = False) -> None:
+    """
+    End the episodes that go on in the model's buffer, and begin new ones, from which the next ``learn(...,
+    reset_num_timesteps=False)`` goes on.
+
+    :param model: between two rollouts
+    :param env: the environments, as the rollouts see them; None: ``model.env``
+    :param counted: whether a VecNormalize counts the first observations, as it does with those of other episodes. It must not
+        where this is done once more, or already was
+    """
+    env = model.env if env is None else env
+    assert env is not None
+    buffer = getattr(model, "replay_buffer", None)
+    if isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is cut is what we want
+            buffer.truncate_last_trajectory()
+    noise = getattr(model, "action_noise", None)
+    if noise is not None:
+        noise.reset()
+    normalize = model.get_vec_normalize_env()
+    counts = normalize is not None and normalize.training
+    if normalize is not None:
+        normalize.training = counts and counted
+    try:
+        model._last_obs = env.reset()  # type: ignore[assignment]
+    finally:
+        if normalize is not None:
+            normalize.training = counts
+    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
+    if normalize is not None:
+        model._last_original_obs = normalize.get_original_obs()

@@ -89,7 +89,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     """
     where = f"{path}, {env_id}"
     algorithm = algorithms()[algo]
-    arguments = set(inspect.signature(algorithm.__init__).parameters) - {"self", "env", "seed", "device"}
+    arguments = (argument_names(algorithm) or set()) - {"env", "seed", "device"}
     check_names(where, hyperparameters, {*arguments, *ZOO_KEYS})
     missing = {key for key in ("policy", "n_timesteps") if hyperparameters.get(key) is None}
     if missing:

@@ -39,12 +39,14 @@ class Demonstration:
     :param actions: in the environment's units, shape ``(T, *action_shape)``; clipped to the environment's bounds
     :param rewards: shape ``(T,)``
     :param terminated: the environment ended the episode itself; if not, it was cut off and the critic bootstraps
+    :param instance: which object it was about, as the environment's ``info["instance"]`` names it; None if it names none
     """
 
     observations: dict[str, np.ndarray]
     actions: np.ndarray
     rewards: np.ndarray
     terminated: bool = False
+    instance: str | None = None
 
 
 def read_demonstrations(
@@ -214,14 +216,30 @@ def as_transitions(
     episodes: Sequence[Demonstration], observation_space: spaces.Dict, action_space: spaces.Space
 ) -> list[tuple[Any, ...]]:
     """
+    :param episodes: demonstrations
+    :return: for each step, what a buffer's ``add()`` takes, for one environment; see :func:`as_arrays`
+    """
+    arrays = as_arrays(episodes, observation_space, action_space)
+    return [
+        step
+        for (observations, actions, rewards), episode in zip(arrays, episodes, strict=True)
+        for step in _steps(observations, actions, rewards, episode.terminated)
+    ]
+
+
+def as_arrays(
+    episodes: Sequence[Demonstration], observation_space: spaces.Dict, action_space: spaces.Space
+) -> list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
+    """
     Actions outside of their bounds, as those of a Gaussian policy are now and then, are clipped, as environments do with them;
     a warning counts them.
 
     :param episodes: demonstrations
-    :return: for each step, what a buffer's ``add()`` takes, for one environment
+    :return: for each its observations by key, shape ``(T + 1, ...)``, images as the space has them; actions within [-1, 1],
+        shape ``(T, action_dim)``; and rewards, shape ``(T,)``
     :raises ValueError: for shapes and values that cannot be, naming the demonstration, what came, and what to do
     """
-    steps: list[tuple[Any, ...]] = []
+    arrays = []
     n_clipped = np.zeros(len(episodes), dtype=np.int64)
     for number, episode in enumerate(episodes):
         with error_prefix(f"Demonstration {number} of {len(episodes)}"):
@@ -230,14 +248,14 @@ def as_transitions(
             rewards = _rewards(episode)
             observations = _observations(episode, len(rewards), observation_space)
             actions, n_clipped[number] = _actions(episode, len(rewards), action_space)
-        steps += _steps(observations, actions, rewards, episode.terminated)
+        arrays.append((observations, actions, rewards))
     if n_clipped.any():
         warnings.warn(
             f"Actions of demonstrations outside of {action_space} are clipped to it, as environments do: {n_clipped.sum()} "
             f"numbers, in {np.count_nonzero(n_clipped)} of {len(episodes)} demonstrations.",
             stacklevel=3,
         )
-    return steps
+    return arrays
 
 
 def _rewards(episode: Demonstration) -> np.ndarray:

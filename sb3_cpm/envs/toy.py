@@ -91,6 +91,24 @@ class ToyEnv(gym.Env):
         success = self._success()
         return self._observe(), self._reward(success), success and self.terminate_on_success, False, {"is_success": success}
 
+    def expert_action(self) -> np.ndarray:
+        """:return: what a scripted expert does now; it pushes from the side of the puck that is away from the goal"""
+        robot, goal = self._positions[:2]
+        target = goal
+        if self.task == "push":
+            puck = self._positions[2]
+            ahead = (goal - puck) / max(self._distance(1, 2), 1e-9)
+            target = robot if self._success() else puck - 2 * BODY_RADIUS * ahead  # where the robot touches it
+            offset = robot - puck
+            if not self._success() and offset @ ahead > -0.9 * np.hypot(*offset):  # not behind it: around it, at a distance
+                aside = np.array([-ahead[1], ahead[0]])
+                side = 1.0 if offset @ aside >= 0 else -1.0
+                beside = puck + 3 * BODY_RADIUS * (side * aside if offset @ ahead > 0 else -ahead)
+                target = beside
+            elif not self._success():
+                target = target + np.clip(goal - puck, -STEP_LENGTH, STEP_LENGTH)
+        return np.clip((target - robot) / STEP_LENGTH, -1.0, 1.0).astype(np.float32)
+
     def render(self) -> np.ndarray | None:
         """:return: the table from above, shape ``(256, 256, 3)``, uint8"""
         if self.render_mode != "rgb_array":

@@ -19,6 +19,7 @@ from sb3_cpm.envs.maniskill import clouds
 from sb3_cpm.envs.maniskill import observations as obs_tools
 from sb3_cpm.envs.maniskill.checks import explained
 from sb3_cpm.envs.maniskill.cpu_speedups import speed_up
+from sb3_cpm.envs.maniskill.experts import Expert, make_expert
 from sb3_cpm.envs.maniskill.start_states import StartState, restore, state_of
 from sb3_cpm.envs.maniskill.visuals import Visuals
 from sb3_cpm.machine.thread_affinity import follow_simulation
@@ -79,6 +80,7 @@ class ManiSkillBatch:
         self.shows_goal = False
         self.goal: Any = None  # a goal view wants to know where things are, see `sb3_cpm.envs.maniskill.goals`
         self._visuals = visuals
+        self._experts: dict[int, Expert] = {}
         self._labels = np.zeros((self.num_envs, 1), dtype=np.int16)
         self.cameras = self._choose_cameras(cameras) if obs_mode == "visual" else ()
         self._scene_changed()
@@ -113,6 +115,8 @@ class ManiSkillBatch:
         """
         states = [None] * len(rows) if states is None else states
         self.episode_seeds[rows] = [s["seed"] if s is not None else seed for s, seed in zip(states, seeds, strict=True)]
+        for row in rows.tolist():
+            self._experts.pop(row, None)
         everyone = len(rows) == self.num_envs
         index = th.as_tensor(rows, device=self.env.device)
         given = self.episode_seeds.copy()
@@ -194,6 +198,16 @@ class ManiSkillBatch:
         """
         grasps = {key: bool(values[i]) for key, values in self._grasps.items()}
         return state_of(self.env, i, self.env_id, int(self.episode_seeds[i]), grasps)
+
+    def expert_action(self, i: int) -> np.ndarray:
+        """
+        :param i: index of the environment
+        :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
+        :raises ValueError: if the task has none, or none for this controller
+        """
+        if i not in self._experts:
+            self._experts[i] = make_expert(self.env_id, self.env, i)
+        return self._experts[i].act()
 
     def _remember_grasps(self, host: dict[str, Any], rows: np.ndarray) -> None:
         for part in (host["extra"], host["info"]):

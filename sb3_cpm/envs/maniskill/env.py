@@ -98,6 +98,13 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
         """ManiSkill's spec with the number of steps that really ends an episode."""
         return spec_of(self.batch)
 
+    def expert_action(self) -> np.ndarray:
+        """
+        :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
+        :raises ValueError: if the task has none, or none for this controller
+        """
+        return self.batch.expert_action(0)
+
     # ------------------------------------------------------------------ start states
     def get_state(self) -> StartState:
         """:return: where this episode is now, for ``reset(options={"state": ...})``; plain data, about 2 kB"""

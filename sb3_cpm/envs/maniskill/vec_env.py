@@ -174,6 +174,13 @@ class Member:
             return None
         return np.array(self._batch.env.render()[self._index].cpu().numpy(), dtype=np.uint8)
 
+    def expert_action(self) -> np.ndarray:
+        """
+        :return: what the task's scripted expert does now
+        :raises ValueError: if the task has none, or none for this controller
+        """
+        return self._batch.expert_action(self._index)
+
     def get_state(self) -> StartState:
         """:return: where this episode is now"""
         return self._batch.get_state(self._index)
