@@ -13,13 +13,17 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import needed
+from sb3_cpm.policies import LayerNormPolicy, RLPDPolicy, SimbaPolicy
 
 NAMES: dict[str, Any] = {
     "CPMBuffer": CPMBuffer,
     # `enjoy` passes an environment to `load`, without which SB3 makes no such buffer, only if it reads "HerReplayBuffer"
     "CPMHerReplayBuffer": CPMBuffer,
+    "LayerNormPolicy": LayerNormPolicy,
     "PointNetExtractor": PointNetExtractor,
     "PointNetPolicy": PointNetPolicy,
+    "RLPDPolicy": RLPDPolicy,
+    "SimbaPolicy": SimbaPolicy,
 }
 
 ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore}
