@@ -6,6 +6,7 @@ evaluates in the namespace of its experiment manager (:data:`NAMES`).
 
 from typing import Any
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cpm.arguments import nearest
@@ -26,7 +27,8 @@ NAMES: dict[str, Any] = {
     "SimbaPolicy": SimbaPolicy,
 }
 
-ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore}
+#: RLPD is SAC with a policy and settings of its own, which its files have.
+ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore, "rlpd": SAC}
 
 
 def add_names() -> None:
