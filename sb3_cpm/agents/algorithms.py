@@ -13,6 +13,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import needed
+from sb3_cpm.imitation import DAPG
 
 NAMES: dict[str, Any] = {
     "CPMBuffer": CPMBuffer,
@@ -22,7 +23,7 @@ NAMES: dict[str, Any] = {
     "PointNetPolicy": PointNetPolicy,
 }
 
-ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore}
+ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore, "dapg": DAPG}
 
 
 def add_names() -> None:
