@@ -271,6 +271,7 @@ class CPMBuffer(EpisodeBuffer):
         assert self.demonstrations is not None
         # SB3 sets a loaded buffer's device, and knows nothing of a second one in it
         self.demonstrations.player_keys, self.demonstrations.device = self.player_keys, self.device
+        self.demonstrations.attach_reward(self.reward_of, self.reward_keys)
         demonstrated = self.demonstrations.sample(n_demonstrated, env)
         return _concatenate(self._sample_own(n_ours - n_imaginary, n_imaginary, env), demonstrated) if n_ours else demonstrated
 
