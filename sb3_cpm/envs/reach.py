@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 
 #: Metres that an action of 1 moves the point, by instance.
-GAINS = {"strong": 0.15, "medium": 0.1, "weak": 0.05}
-SUCCESS_DISTANCE = 0.1
+GAINS = {"strong": 0.12, "medium": 0.08, "weak": 0.05}
+SUCCESS_DISTANCE = 0.15
 
 
 class ReachEnv(gym.Env):
