@@ -14,6 +14,7 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import needed
+from sb3_cpm.imitation import DAPG
 from sb3_cpm.policies import LayerNormPolicy, RLPDPolicy, SimbaPolicy
 
 NAMES: dict[str, Any] = {
@@ -28,7 +29,7 @@ NAMES: dict[str, Any] = {
 }
 
 #: RLPD is SAC with a policy and settings of its own, which its files have.
-ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore, "rlpd": SAC}
+ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore, "dapg": DAPG, "rlpd": SAC}
 
 
 def add_names() -> None:

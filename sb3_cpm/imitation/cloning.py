@@ -69,8 +69,9 @@ class CloneResult(NamedTuple):
     seconds: float
 
     def scalars(self) -> dict[str, float]:
-        """:return: its numbers by name, for a logger"""
-        return {name: value for name, value in self._asdict().items() if isinstance(value, (int, float))}
+        """:return: what one seed decides, by name, for a logger"""
+        given = {**self._asdict(), "seconds": None}
+        return {name: value for name, value in given.items() if isinstance(value, (int, float))}
 
 
 def clone(
