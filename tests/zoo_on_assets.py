@@ -20,6 +20,7 @@ SHORT = {
     "ppo_rgbd": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
     "ppo_pointcloud": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
     "cpm_sac_report": {"train_freq": 1},
+    **{agent: {"callback": [{"sb3_cpm.imitation.DemonstrationsCallback": {"n_episodes": 1}}]} for agent in ("rlpd", "cpm_rlpd")},
 }
 
 ENTRIES = [
