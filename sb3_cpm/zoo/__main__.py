@@ -7,8 +7,7 @@ rl_zoo3's commands, with our algorithms among the choices of ``--algo`` and our 
     python -m sb3_cpm.zoo train --agent sac_her --env PointMaze_UMaze-v3      gymnasium-robotics is imported
 
 All options are rl_zoo3's own but one: ``--agent NAME`` stands for ``--algo ALGO --conf-file zoo_configs/NAME.yml``. And
-``train --algo`` with an algorithm of ours (``dreamer``, ``rlpd``, ...) and without ``--conf-file`` takes the file of that name,
-since rl_zoo3 has none.
+``train --algo dreamer`` (or another of our algorithms) without ``--conf-file`` takes the file of that name: rl_zoo3 has none.
 """
 
 import importlib

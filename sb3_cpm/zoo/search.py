@@ -82,8 +82,8 @@ def install() -> None:
     """Give our search spaces to rl_zoo3. Can be repeated."""
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-    for space in (HYPERPARAMS_SAMPLER, HYPERPARAMS_CONVERTER):
-        space.setdefault("rlpd", space["sac"])  # it is a SAC
+    HYPERPARAMS_SAMPLER.setdefault("rlpd", HYPERPARAMS_SAMPLER["sac"])  # it is a SAC
+    HYPERPARAMS_CONVERTER.setdefault("rlpd", HYPERPARAMS_CONVERTER["sac"])
     for algo in PLAYERS:
         if not hasattr(HYPERPARAMS_SAMPLER[algo], "of_player"):
             HYPERPARAMS_SAMPLER[algo] = _keeping_policy(HYPERPARAMS_SAMPLER[algo])
