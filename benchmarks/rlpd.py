@@ -49,7 +49,7 @@ def make(kind: str, batch_size: int, net_arch: list[int]) -> SAC:
     """:return: a model whose buffer is filled"""
     policy, kwargs = KINDS[kind]
     kwargs = {"net_arch": net_arch, **kwargs}
-    model = SAC(policy, Noise(), policy_kwargs=kwargs, batch_size=batch_size, learning_starts=500, buffer_size=500, device="cpu")
+    model = SAC(policy, Noise(), batch_size=batch_size, learning_starts=500, policy_kwargs=kwargs, device="cpu")
     return model.learn(505)
 
 
