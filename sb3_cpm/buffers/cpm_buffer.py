@@ -269,8 +269,18 @@ class CPMBuffer(EpisodeBuffer):
         n_ours = batch_size - n_demonstrated
         if not n_demonstrated:
             return self._sample_own(n_ours - n_imaginary, n_imaginary, env)
-        demonstrated = self._demonstrations_for_player().sample(n_demonstrated, env)
+        demonstrated = self.sample_demonstrations(n_demonstrated, env)
         return _concatenate(self._sample_own(n_ours - n_imaginary, n_imaginary, env), demonstrated) if n_ours else demonstrated
+
+    def sample_demonstrations(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:
+        """
+        A batch of demonstrations alone; there must be some.
+
+        :param batch_size: number of transitions
+        :param env: associated VecEnv to normalize the observations and rewards
+        :return: as :meth:`sample`
+        """
+        return self._demonstrations_for_player().sample(batch_size, env)  # type: ignore[return-value]
 
     def _demonstrations_for_player(self) -> EpisodeBuffer:
         assert self.demonstrations is not None

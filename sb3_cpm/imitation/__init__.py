@@ -1,13 +1,14 @@
 """
 Learning from demonstrations: recorded episodes of somebody who can do the task, for agents of Stable-Baselines3.
 
-================  ==============================================================================
-``recording``     episodes of the scripted expert that an environment has, as training sees them
-``loading``       demonstrations from wherever they are: an expert, files, a list
-``callback``      :class:`DemonstrationsCallback` fills the replay buffer when training starts
-``cloning``       :func:`clone`: an actor learns demonstrated actions; as a callback, before PPO
-``dapg``          :class:`DAPG`: PPO beside demonstrations
-================  ==============================================================================
+==================  ============================================================================
+``recording``       episodes of the scripted expert that an environment has, as training sees them
+``loading``         demonstrations from wherever they are: an expert, files, a list
+``callback``        :class:`DemonstrationsCallback` fills the replay buffer when training starts
+``cloning``         :func:`clone`: an actor learns demonstrated actions; as a callback, before PPO
+``dapg``            :class:`DAPG`: PPO beside demonstrations
+``regularization``  :class:`BCLossCallback`: an off-policy actor keeps to its demonstrations
+==================  ============================================================================
 """
 
 from sb3_cpm.imitation.callback import DemonstrationsCallback, demonstrations_for
@@ -15,9 +16,11 @@ from sb3_cpm.imitation.cloning import CloneCallback, CloneResult, clone
 from sb3_cpm.imitation.dapg import DAPG
 from sb3_cpm.imitation.loading import load_demonstrations
 from sb3_cpm.imitation.recording import record_demonstrations
+from sb3_cpm.imitation.regularization import BCLossCallback
 
 __all__ = [
     "DAPG",
+    "BCLossCallback",
     "CloneCallback",
     "CloneResult",
     "DemonstrationsCallback",
