@@ -371,3 +371,21 @@ def test_the_actor_is_what_its_action_depends_on() -> None:
     assert found == [
         *("mlp_extractor.policy_net.0.weight", "mlp_extractor.policy_net.0.bias", "action_net.weight", "action_net.bias")
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.maniskill
+def test_a_clone_of_scripted_episodes_picks_the_cube() -> None:
+    """120 episodes and 3000 updates, for CI: half of what docs/imitation.md reports."""
+    pytest.importorskip("mani_skill")
+    from sb3_cpm.agents.tasks import register_tasks
+    from sb3_cpm.run.evaluation import evaluate
+
+    register_tasks()
+    env = make_vec_env("CPM/PickCubeState-v1", seed=0)
+    policy_kwargs = {"net_arch": [256, 256], "activation_fn": th.nn.ReLU}
+    model = PPO("MultiInputPolicy", env, n_steps=50, batch_size=50, seed=0, device="cpu", policy_kwargs=policy_kwargs)
+    clone(model, record_demonstrations(env, 120, seed=0), n_updates=3000, learning_rate=1e-3)
+    outcomes = evaluate(model, env, 20)
+    env.close()
+    assert np.mean([outcome.success_once for outcome in outcomes]) >= 0.3

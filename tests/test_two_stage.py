@@ -46,7 +46,9 @@ def make_env() -> VecEnv:
 
 
 def make_model(seed: int, kind: type[BaseAlgorithm] = PPO, **kwargs: Any) -> BaseAlgorithm:
-    sizes = {PPO: {"n_steps": 40, "batch_size": 20}, A2C: {"n_steps": 40}}.get(kind, {"buffer_size": 400, "batch_size": 20})
+    sizes = {PPO: {"n_steps": 40, "batch_size": 20, "n_epochs": 4, "learning_rate": 1e-3}, A2C: {"n_steps": 40}}.get(
+        kind, {"buffer_size": 400, "batch_size": 20}
+    )
     env = VecNormalize(make_env(), norm_reward=False)
     return kind("MlpPolicy", env, seed=seed, device="cpu", policy_kwargs={"net_arch": [8]}, **{**sizes, **kwargs})
 

@@ -499,25 +499,35 @@ class EpisodeBuffer(HerReplayBuffer):
         :return: its states, one array of shape ``(length + 1, *observation_shape)`` per key
         :raises ValueError: if D has overwritten it
         """
-        self._check_present(episode)
-        slots = episode.slots(self.buffer_size)
-        at = self.ring.locate(slots, np.full(episode.length, episode.env_idx))
-        last = self.ring.locate(slots[-1:], np.array([episode.env_idx]))
+        home = self._home(episode)
+        slots = episode.slots(home.buffer_size)
+        at = home.ring.locate(slots, np.full(episode.length, episode.env_idx))
+        last = home.ring.locate(slots[-1:], np.array([episode.env_idx]))
         return {
-            key: np.concatenate([self.ring.read(key, at), self.ring.read_next(key, last)])
+            key: np.concatenate([home.ring.read(key, at), home.ring.read_next(key, last)])
             for key in (self.observations if keys is None else keys)
         }
 
     def episode_actions(self, episode: Episode) -> np.ndarray:
         """:return: executed actions of an episode that is still in D, within [-1, 1], shape ``(length, action_dim)``"""
-        self._check_present(episode)
-        return self.actions[episode.slots(self.buffer_size), episode.env_idx]
+        home = self._home(episode)
+        return home.actions[episode.slots(home.buffer_size), episode.env_idx]
 
-    def _check_present(self, episode: Episode) -> None:
+    def episode_rewards(self, episode: Episode) -> np.ndarray:
+        """:return: the task's rewards of an episode that is still in D, shape ``(length,)``"""
+        home = self._home(episode)
+        return home.rewards[episode.slots(home.buffer_size), episode.env_idx]
+
+    def _home(self, episode: Episode) -> "EpisodeBuffer":
+        """
+        :return: the buffer that an episode is in
+        :raises ValueError: if it is no longer there
+        """
         if not self.books.holds(episode):
             raise ValueError(
                 f"{episode} is no longer in the buffer, which holds {self.buffer_size} transitions per environment"
             )
+        return self
 
     @property
     def episodes(self) -> list[Episode]:

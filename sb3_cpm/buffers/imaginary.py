@@ -1,7 +1,8 @@
 """
 The imaginary buffer I: challenges as views into D (report, sections 3.2.1 and 4.3).
 
-A challenge holds positions in D, rewards of its own and what it was chosen for, no observations. It ends with its episode.
+A challenge holds positions in D, rewards of its own and what it was chosen for, no observations. It ends with its episode,
+or lives on among the demonstrations, which are never overwritten.
 """
 
 from collections import deque
@@ -23,7 +24,7 @@ class Challenge:
     """
     A challenge in I: transitions ``first`` to ``goal`` of an episode, with artificial rewards.
 
-    :param episode: the episode in D that it is cut from
+    :param episode: the episode in D, or among the demonstrations, that it is cut from
     :param proposal: its evaluation and its rewards
     :param number: how many challenges were kept before it
     :param added_at: number of transitions that D had been given when it was kept
@@ -110,7 +111,7 @@ class ImaginaryBuffer:
 
     def keep(self, episode: Episode, proposal: Proposal, now: int) -> None:
         """
-        :param episode: the episode in D
+        :param episode: the episode in D, or among the demonstrations
         :param proposal: an accepted one
         :param now: number of transitions that D has been given
         """
@@ -184,6 +185,7 @@ class ImaginaryRows(NamedTuple):
     :param rewards: their artificial rewards
     :param is_goal: whether they lead to the goal
     :param goal_slots: of the transitions that lead to the goals of their challenges
+    :param demonstrated: whether they, and these, are among the demonstrations instead
     """
 
     slots: np.ndarray
@@ -191,6 +193,12 @@ class ImaginaryRows(NamedTuple):
     rewards: np.ndarray
     is_goal: np.ndarray
     goal_slots: np.ndarray
+    demonstrated: np.ndarray
+
+    def of(self, demonstrated: bool) -> "ImaginaryRows":
+        """:return: those of one kind"""
+        chosen = self.demonstrated == demonstrated
+        return ImaginaryRows(*(column[chosen] for column in self))
 
 
 @dataclass(frozen=True)
@@ -205,13 +213,17 @@ class _Index:
         columns = []
         for challenge in challenges:
             steps = np.arange(challenge.start, challenge.goal + 1)
+            slots = challenge.episode.start + steps
+            if not challenge.episode.demonstrated:
+                slots %= buffer_size
             columns.append(
                 (
-                    (challenge.episode.start + steps) % buffer_size,
+                    slots,
                     np.full(len(steps), challenge.environment),
                     challenge.rewards.astype(np.float32),
                     steps == challenge.goal,
-                    np.full(len(steps), (challenge.episode.start + challenge.goal) % buffer_size),
+                    np.full(len(steps), slots[-1]),
+                    np.full(len(steps), challenge.episode.demonstrated),
                     np.full(len(steps), challenge.rewarded_at),
                 )
             )

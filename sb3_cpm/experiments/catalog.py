@@ -128,6 +128,8 @@ PARTS = (
     ),
     Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
 )
+BC_PPO = Contender("BC + PPO", "bc_ppo")
+DAPG = Contender("BC + DAPG", "dapg")
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
 
@@ -155,6 +157,16 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "imitation",
+        "",
+        "PickCube-v1 from state vectors: learning from 200 scripted episodes",
+        "not in the report: its prior winners cloned or used PPO; the evaluation at step 0 is the clone's",
+        (BC_PPO, DAPG, SAC),
+        "curves",
+        Plan(CONTROLLERS[:1], 100_000, 10_000, 20, 5, STATE, cost="8 to 12 CPU minutes per run, SAC up to 38"),
+        Plan((TOY,), 2000, 1000, 5, 1, SMALL, cost="1 minute on 2 cores"),
     ),
     Experiment(
         "pickcube-parts",

@@ -19,6 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from torch import nn
@@ -222,10 +223,9 @@ def make_rows(policy: BasePolicy, episodes: Sequence[Arrays], normalize: VecNorm
     """
     observations = _stacked(episodes, _keys_of_actor(policy))
     if normalize is not None and normalize.norm_obs:
-        of_dict = isinstance(policy.observation_space, spaces.Dict)
-        statistics = normalize.obs_rms if of_dict else {OBSERVATION: normalize.obs_rms}
+        statistics = _statistics(normalize)
         observations = {
-            key: normalize._normalize_obs(rows, statistics[key]) if key in statistics else rows  # type: ignore[index, operator]
+            key: normalize._normalize_obs(rows, statistics[key]) if key in statistics else rows
             for key, rows in observations.items()
         }
     return DemonstratedRows(policy, observations, np.concatenate([actions for _, actions in episodes]))
@@ -236,10 +236,14 @@ def _stacked(episodes: Sequence[Arrays], keys: Iterable[str]) -> dict[str, np.nd
     return {key: np.concatenate([observations[key][:-1] for observations, _ in episodes]) for key in keys}
 
 
+def _statistics(normalize: VecNormalize) -> dict[str, RunningMeanStd]:
+    found = normalize.obs_rms
+    return found if isinstance(found, dict) else {OBSERVATION: found}
+
+
 def _count(normalize: VecNormalize, episodes: Sequence[Arrays]) -> None:
     """As though the observations had been seen in training."""
-    found: Any = normalize.obs_rms
-    statistics = found if isinstance(found, dict) else {OBSERVATION: found}
+    statistics = _statistics(normalize)
     for key, rows in _stacked(episodes, statistics).items():
         statistics[key].update(rows)
 

@@ -56,7 +56,7 @@ class DAPG(PPO):
     def __init__(
         self,
         policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str | None,
+        env: GymEnv | str,
         demonstrations: Source | None = None,
         n_episodes: int | None = None,
         hold: bool = False,

@@ -119,13 +119,18 @@ class MLPs(nn.Module):
             self.scales.append(nn.Parameter(th.ones(n, 1, size)))
             self.shifts.append(nn.Parameter(th.zeros(n, 1, size)))
 
-    def forward(self, inputs: th.Tensor, chosen: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, chosen: th.Tensor | None = None, frozen: bool = False) -> th.Tensor:
         """
         :param inputs: shape ``(batch, n_inputs)``
         :param chosen: which MLPs, shape ``(m,)``; None: all n
+        :param frozen: only the inputs get a gradient
         :return: shape ``(m, batch, 1)``
         """
-        pick = (lambda parameter: parameter) if chosen is None else (lambda parameter: parameter[chosen])
+
+        def pick(parameter: th.Tensor) -> th.Tensor:
+            parameter = parameter.detach() if frozen else parameter
+            return parameter if chosen is None else parameter[chosen]
+
         values = inputs.expand(len(pick(self.biases[-1])), *inputs.shape)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if layer > 0:

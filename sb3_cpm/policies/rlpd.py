@@ -60,8 +60,9 @@ class RLPDCritic(FrugalCritic):
         inputs = th.cat((self.features(obs, actions), actions), dim=1)
         if not th.is_grad_enabled():
             return self.networks(inputs, th.randperm(self.n_critics, device=inputs.device)[: self.n_min]).unbind(0)
-        values = self.networks(inputs)  # (n_critics, batch, 1)
-        return (values.mean(0),) if actions.requires_grad else values.unbind(0)
+        if actions.requires_grad:  # SAC clears what the actor's loss leaves in the critics, so it need not be computed
+            return (self.networks(inputs, frozen=True).mean(0),)
+        return self.networks(inputs).unbind(0)
 
 
 class RLPDPolicy(PointNetPolicy):

@@ -29,7 +29,8 @@ def extractor_for(space: spaces.Space) -> type[BaseFeaturesExtractor]:
 
 class _Shaped(BasePolicy):
     """
-    A mixin in front of a policy of SB3 or sb3-contrib with ``latent_pi`` in its actor and ``q_networks`` in its critic.
+    A mixin in front of a policy of SB3 or sb3-contrib with ``latent_pi`` (SAC, TQC) or ``mu`` (TD3, DDPG) in its actor and
+    ``q_networks`` in its critic.
 
     :param observation_space: vectors, images, or a Dict of them and of clouds
     :param action_space: Box space
@@ -63,7 +64,12 @@ class _Shaped(BasePolicy):
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         actor = super().make_actor(features_extractor)  # type: ignore[misc]
-        actor.latent_pi = self.actor_trunk(actor.features_dim, actor.net_arch).to(self.device)
+        trunk = self.actor_trunk(actor.features_dim, actor.net_arch)
+        if hasattr(actor, "latent_pi"):
+            actor.latent_pi = trunk.to(self.device)
+        else:
+            mean = nn.Linear(actor.net_arch[-1], get_action_dim(self.action_space))
+            actor.mu = nn.Sequential(trunk, mean, nn.Tanh()).to(self.device)
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
