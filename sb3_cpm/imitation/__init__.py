@@ -1,7 +1,6 @@
 """
 Learning from demonstrations: recorded episodes of somebody who can do the task, for agents of Stable-Baselines3.
 
-=======
 ==================  ============================================================================
 ``recording``       episodes of the scripted expert that an environment has, as training sees them
 ``loading``         demonstrations from wherever they are: an expert, files, a list
