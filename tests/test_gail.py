@@ -16,11 +16,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_cpm.envs.reach  # noqa: F401  (registers CPMReach-v0)
 from sb3_cpm import ChallengerCallback, CPMBuffer
 from sb3_cpm.agents import load_agent
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.envs import DictObservation, ToyEnv
+from sb3_cpm.envs.reach import SUCCESS_DISTANCE
 from sb3_cpm.imitation import (
     GAILCallback,
     InstanceBuffer,
@@ -138,7 +138,7 @@ def test_bad_discriminators(kwargs: Any, message: str) -> None:
 
 def test_clouds_without_labels_are_refused() -> None:
     env = ToyEnv()
-    with pytest.raises(ValueError, match="without the label of their part.*point_labels='roles'"):
+    with pytest.raises(ValueError, match="without the label of their part.*point_labels=True"):
         ProgressiveDiscriminator(env.observation_space, env.action_space)
     with pytest.raises(ValueError, match="there are none among"):
         VectorDiscriminator(spaces.Dict({"pointcloud": CLOUDS["pointcloud"]}), ACTIONS)
@@ -308,9 +308,9 @@ def test_successes_join_the_expert_up_to_the_first_successful_step() -> None:
         if not demonstration:
             added.append((instance, len(actions)))
             point, goal = observations["state"][-1][:2], observations["state"][-1][2:4]
-            assert np.hypot(*(point - goal)) < 0.1  # what the last action led to
+            assert np.hypot(*(point - goal)) < SUCCESS_DISTANCE  # what the last action led to
             earlier = observations["state"][1:-1]
-            assert (np.hypot(*(earlier[:, :2] - earlier[:, 2:4]).T) >= 0.1).all()
+            assert (np.hypot(*(earlier[:, :2] - earlier[:, 2:4]).T) >= SUCCESS_DISTANCE).all()
         add(self, instance, observations, actions, demonstration)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -375,10 +375,10 @@ def test_it_learns_without_a_reward_and_not_from_noise() -> None:
                 _shuffled(record_demonstrations(built.env, 20, seed=1, hold=True)),
                 None,
             )
-        built.model.learn(5000, callback=callback)
+        built.model.learn(6000, callback=callback)
         outcomes = evaluate(built.model, built.make_eval_env(), 50, 1_000_000)
         success[shuffled] = np.mean([outcome.success_once for outcome in outcomes])
-    assert success[False] > 0.8 and success[True] < 0.5
+    assert success[False] > 0.6 and success[True] < 0.4
 
 
 def _shuffled(demonstrations: list[Demonstration]) -> list[Demonstration]:
