@@ -975,11 +975,12 @@ CHAINS = {
         10,
     ),
     "dreamer": (OURS, "dreamer", TOY, 200, 100, ["learning_starts:100", "train_freq:50"], 50),
+    "cpm_rlpd": (OURS, "rlpd", TOY, 200, 100, ["learning_starts:100", "batch_size:8", "train_freq:4"], 50),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer"])
+@pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer", "cpm_rlpd"])
 def test_train_enjoy_resume_plot(name: str, warm: Command, tmp_path: Path) -> None:
     program, algo, env_id, n_steps, n_more, parameters, length = CHAINS[name]
 
