@@ -185,8 +185,8 @@ def _check_expert(env: VecEnv) -> None:
     if not env.has_attr(EXPERT):
         raise ValueError(
             f"The environment has no expert, a method {EXPERT}() that gives the next action. CPMToy-v0, CPMReach-v0 and "
-            "these tasks of ManiSkill have one: PickCube-v1, LiftCube-v1, PushCube-v1, PullCube-v1. Give a file of demonstrations "
-            "instead of 'expert'."
+            "these tasks of ManiSkill have one: PickCube-v1, LiftCube-v1, PushCube-v1, PullCube-v1. Give a file of "
+            "demonstrations instead of 'expert'."
         )
     if any(env.env_is_wrapped(gym.ActionWrapper)):
         raise ValueError(
