@@ -210,7 +210,7 @@ class GAILCallback(StatefulCallback):
         self.n_successes = 0
         self._round: list[Episode] = []
         self._played: list[Played] = []
-        self._lengths = np.zeros(0, dtype=np.int64)
+        self._lengths: list[int] = []  # of the running episodes
         self._first_success: list[int | None] = []
         self._told: set[str] = set()
 
@@ -248,7 +248,7 @@ class GAILCallback(StatefulCallback):
             warnings.warn("The player's buffer has none of the demonstrations that the discriminator knows.", stacklevel=2)
         self.discriminator.plan(self._planned_updates())
         n_envs = model.n_envs
-        self._lengths, self._first_success = np.zeros(n_envs, dtype=np.int64), [None] * n_envs
+        self._lengths, self._first_success = [0] * n_envs, [None] * n_envs
         self._played = []
         buffer.attach_reward(self.player_rewards, self.discriminator.keys, lambda: _learns(model))
 
@@ -340,8 +340,8 @@ class GAILCallback(StatefulCallback):
     # ------------------------------------------------------------------ what it learns from
 
     def _on_step(self) -> bool:
-        self._lengths += 1
         for i, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
+            self._lengths[i] += 1
             success = info.get("is_success", info.get("success"))
             if success is None and self.self_imitation:
                 raise ValueError(
@@ -349,9 +349,9 @@ class GAILCallback(StatefulCallback):
                     "'is_success' nor 'success'. Wrap it in one that adds it, or give GAILCallback self_imitation=False."
                 )
             if success and self._first_success[i] is None:
-                self._first_success[i] = int(self._lengths[i]) - 1
+                self._first_success[i] = self._lengths[i] - 1
             if done:
-                self._played.append(Played(i, int(self._lengths[i]), self._first_success[i], info.get("instance")))
+                self._played.append(Played(i, self._lengths[i], self._first_success[i], info.get("instance")))
                 self._lengths[i], self._first_success[i] = 0, None
                 if self.reward == "softplus" and not info.get("TimeLimit.truncated", False):
                     self._warn_of_ends("episodes of the player")
