@@ -280,7 +280,7 @@ class CPMBuffer(EpisodeBuffer):
         :param env: associated VecEnv to normalize the observations and rewards
         :return: as :meth:`sample`
         """
-        return self._demonstrations_for_player().sample(batch_size, env)  # type: ignore[return-value]
+        return self._demonstrations_for_player().sample(batch_size, env)
 
     def _demonstrations_for_player(self) -> EpisodeBuffer:
         assert self.demonstrations is not None

@@ -141,7 +141,8 @@ RLPD = (
         "SAC, layer normalisation",
         "sac_layernorm",
         {
-            **{"env_kwargs": {"reward_mode": "sparse", "ignore_terminations": False}, "policy_kwargs": {"net_arch": [128, 128]}},
+            "env_kwargs": {"reward_mode": "sparse", "ignore_terminations": False},
+            "policy_kwargs": {"net_arch": [128, 128]},
             **{"batch_size": 128, "gamma": 0.95, "tau": 0.005, "train_freq": 1, "gradient_steps": 2},
         },
     ),

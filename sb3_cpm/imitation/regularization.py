@@ -60,8 +60,8 @@ class BCLossCallback(BaseCallback):
         model: Any = self.model
         if not isinstance(getattr(model, "replay_buffer", None), CPMBuffer):
             raise ValueError(
-                f"BCLossCallback reads demonstrations from a CPMBuffer, which this {type(model).__name__} has not: make it with "
-                "replay_buffer_class=CPMBuffer, replay_buffer_kwargs=dict(challenge_ratio=0, demonstration_ratio=0.5)."
+                f"BCLossCallback reads demonstrations from a CPMBuffer, which this {type(model).__name__} has not: make it "
+                "with replay_buffer_class=CPMBuffer, replay_buffer_kwargs=dict(challenge_ratio=0, demonstration_ratio=0.5)."
             )
         self._seen = model._n_updates
 
