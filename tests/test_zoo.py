@@ -108,6 +108,16 @@ def test_agents_that_are_compared_differ_in_what_is_compared() -> None:
     assert cpm["CPM/PickCube-v1"]["policy"] == plain["CPM/PickCube-v1"]["policy"] == "sb3_cpm.PointNetPolicy"
 
 
+def test_rlpd_with_a_challenger_differs_in_it_only() -> None:
+    plain, cpm = (read_entries(config_folder() / f"{name}.yml") for name in ("rlpd", "cpm_rlpd"))
+    assert plain.keys() == cpm.keys()
+    for env_id, entry in cpm.items():
+        *callbacks, challenger = entry["callback"]
+        assert "sb3_cpm.ChallengerCallback" in challenger and callbacks == plain[env_id]["callback"]
+        buffer = {**plain[env_id]["replay_buffer_kwargs"], "challenge_ratio": 0.25, "max_challenges": 10}
+        assert entry == {**plain[env_id], "callback": entry["callback"], "replay_buffer_kwargs": buffer}, env_id
+
+
 def test_tuned_differs_in_its_challenges_only() -> None:
     simple, tuned = (read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_tuned"))
     assert set(tuned) == {*simple, ".challenges"} - {"CPMToy-v0"}
