@@ -204,7 +204,7 @@ _ALL = (
         "not in the report; with and without a behaviour cloning loss, a challenger, and demonstrations",
         RLPD,
         "curves",
-        Plan(CONTROLLERS[:1], 20_000, 2000, 50, 5, cost="15 to 20 CPU minutes per run"),
+        Plan(CONTROLLERS[:1], 10_000, 2500, 50, 5, cost="7 to 10 CPU minutes per run"),
         Plan(CONTROLLERS[:1], 400, 200, 2, 1, cost="2 minutes on 2 cores"),
     ),
     Experiment(
