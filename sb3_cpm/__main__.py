@@ -1,5 +1,6 @@
 """
-The command line: ``python -m sb3_cpm train | two-stage | watch | reproduce | doctor | setup-rendering | assets``.
+The command line: ``python -m sb3_cpm COMMAND``, of train, two-stage, demonstrate, watch, reproduce, doctor, setup-rendering
+and assets.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -106,6 +107,25 @@ def make_parser() -> argparse.ArgumentParser:
     ):
         two_stage.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
     two_stage.set_defaults(command=_two_stage)
+
+    demonstrate = commands.add_parser(
+        "demonstrate",
+        help="record demonstrations of a task's scripted expert",
+        description="Let the scripted expert of a task play, and write what an agent's training will see (cameras, cloud, "
+        "state) with actions and rewards into a file as ManiSkill has them, for add_demonstrations, clone and agents.",
+    )
+    demonstrate.add_argument("--env", required=True, help="a task, as for train")
+    demonstrate.add_argument("--episodes", type=int, default=200, help="with a success (default: 200)")
+    demonstrate.add_argument("--agent", default="bc_ppo", help="whose file says how the task is made (default: bc_ppo)")
+    demonstrate.add_argument("--output", metavar="FILE", help="the .h5 file (default: named after task and number, in demos/)")
+    demonstrate.add_argument("--seed", type=int, default=0, help="of the environments (default: 0)")
+    demonstrate.add_argument("--n-envs", type=int, default=1, help="parallel environments (default: 1)")
+    demonstrate.add_argument("--hold", action="store_true", help="go on to the end of each episode, holding what was reached")
+    demonstrate.add_argument("--overwrite", action="store_true", help="replace a file that is there")
+    demonstrate.add_argument(
+        "--env-kwargs", nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help="arguments of the environment"
+    )
+    demonstrate.set_defaults(command=_demonstrate)
 
     watch = commands.add_parser(
         "watch",
@@ -233,6 +253,13 @@ def _two_stage(agent: str, env: str, second: dict[str, Any], **arguments: Any) -
     with sigterm_raises():
         result = two_stage_agent(agent, env, second=second or None, tell=print, **arguments)
     print(f"The model is {result.checkpoint / 'model.zip'}")
+    return 0
+
+
+def _demonstrate(**arguments: Any) -> int:
+    with needed("Recording", "run"):
+        from sb3_cpm.run.demonstrate import demonstrate
+    demonstrate(**arguments, progress_bar=sys.stderr.isatty(), tell=print)
     return 0
 
 

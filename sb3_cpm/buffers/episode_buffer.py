@@ -9,7 +9,7 @@ import copy
 import inspect
 import pickle
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,10 @@ NOT_SAVED = ("self", "__class__", "env", "device")
 # Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
 _BOOKS = 3 * 4 + 2 * 8 + 4
 
+
+#: Observations by key (tensors on P's device, each of shape ``(n, *shape)``), actions within [-1, 1], shape
+#: ``(n, action_dim)``, and the environment's rewards, shape ``(n, 1)``, to those that P learns from, shape ``(n, 1)``.
+RewardFunction = Callable[[dict[str, th.Tensor], th.Tensor, th.Tensor], th.Tensor]
 
 #: Key of ``infos[i]`` with the next observation as the environment gave it. What SB3 calls the ``terminal_observation`` has
 #: been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
@@ -134,7 +138,29 @@ class EpisodeBuffer(HerReplayBuffer):
         self.player_keys = None if player_keys is None else tuple(player_keys)
         #: Keys that the goal of a challenge consists of; None where P is not told which challenge it plays.
         self.challenge_keys = None if challenge_keys is None else tuple(challenge_keys)
+        self.attach_reward(None)
         self._allocate()
+
+    # ------------------------------------------------------------------ whose rewards P gets
+
+    def attach_reward(
+        self, function: RewardFunction | None, keys: Sequence[str] = (), is_on: Callable[[], bool] = lambda: True
+    ) -> None:
+        """
+        Give P other rewards, anew whenever it samples; those that are stored stay the environment's. Never saved.
+
+        :param function: to those rewards; None: P gets the environment's again
+        :param keys: observations that it reads, as the environment gave them, whether P reads them or not
+        :param is_on: whether that is still so: a ``learn()`` may have ended in an exception
+        """
+        self._reward = function
+        self._reward_is_on = is_on
+        self.reward_keys = tuple(keys)
+
+    @property
+    def reward_of(self) -> RewardFunction | None:
+        """What gives P its rewards in place of the environment, if anything does."""
+        return self._reward if self._reward is not None and self._reward_is_on() else None
 
     # ------------------------------------------------------------------ storage
 
@@ -335,9 +361,12 @@ class EpisodeBuffer(HerReplayBuffer):
         wanted = self._keys_for_player()
         at = self.ring.locate(rows, envs)
         # VecNormalize wants all the keys that it normalizes, hindsight the goals, whether P reads them or not
-        keys = [key for key in wanted if key in self.observations] if env is None and not n_virtual else self.observations
+        keys = [key for key in wanted if key in self.observations] if env is None and not n_virtual else [*self.observations]
+        reward_of = self.reward_of
+        if reward_of is not None:
+            keys += [key for key in self.reward_keys if key not in keys]
         obs: Any = {key: self.ring.read(key, at) for key in keys}
-        next_obs: Any = {key: self.ring.read_next(key, at) for key in keys}
+        next_obs: Any = {key: self.ring.read_next(key, at) for key in keys if key in wanted or env is not None or n_virtual}
         outcomes = self._outcomes.reshape(-1, 3).take(at.here, axis=0)
         rewards = outcomes[:, :1]
         dones = outcomes[:, 1:2] * (1 - outcomes[:, 2:])
@@ -351,15 +380,21 @@ class EpisodeBuffer(HerReplayBuffer):
             rewards[len(rewards) - len(last_rewards) :, 0] = last_rewards
         if last_is_goal is not None:
             dones[len(dones) - len(last_is_goal) :, 0][last_is_goal] = 1
+        tensor = self._tensor
+        actions = tensor(self.actions.reshape(-1, self.action_dim).take(at.here, axis=0))
+        if reward_of is not None:
+            with th.no_grad():
+                read = {key: tensor(obs[key]) for key in self.reward_keys}
+                given = reward_of(read, actions, tensor(np.ascontiguousarray(rewards)))
+            rewards = given.to(th.float32).cpu().numpy()
         if env is not None:
             obs, next_obs = env.normalize_obs(obs), env.normalize_obs(next_obs)
             rewards = self._normalize_reward(rewards, env)
         if self.challenge_keys is not None and CHALLENGE in wanted:
             obs[CHALLENGE] = next_obs[CHALLENGE] = self._challenges_of(len(rows), last_goals, env)
-        tensor = self._tensor
         return DictReplayBufferSamples(
             observations={key: tensor(obs[key]) for key in wanted},
-            actions=tensor(self.actions.reshape(-1, self.action_dim).take(at.here, axis=0)),
+            actions=actions,
             next_observations={key: tensor(next_obs[key]) for key in wanted},
             dones=tensor(dones),
             rewards=tensor(np.ascontiguousarray(rewards)),
@@ -675,7 +710,8 @@ class EpisodeBuffer(HerReplayBuffer):
         state = super().__getstate__()
         for name in _VIEWS:  # made anew
             del state[name]
-        return {**state, "format": FORMAT}
+        del state["_reward"], state["_reward_is_on"]  # of a running learn()
+        return {**state, "reward_keys": (), "format": FORMAT}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         state = dict(state)
@@ -691,7 +727,9 @@ class EpisodeBuffer(HerReplayBuffer):
             arrays = {name: state.pop(f"_{name}") for name in books.state()[1]}
             books.restore(state.pop("_n_steps"), state.pop("_starts").items(), episodes, **arrays)
             del state["_valid_ends"], state["_earliest_began"]
+        state.setdefault("challenge_keys", None)  # pickled before there were any
         super().__setstate__(state)
+        self.attach_reward(None)
         self._link_views()
 
 

@@ -501,7 +501,8 @@ class CloneCallback(BaseCallback):
     :func:`clone` when ``learn()`` begins, once in a model's life: a run that is resumed, and a further ``learn()``, go on with
     what there is.
 
-    What PPO learns next would erase the clone as long as its value is a random network's. ``critic_warmup`` rounds train the
+    What PPO learns next would erase the clone as long as its value is a random network's (and also where its actions are much
+    noisier than the clone's: give it ``log_std_init=-2.5`` and a learning rate of 1e-4). ``critic_warmup`` rounds train the
     value alone: what the actor reads, and its standard deviation, get no gradient meanwhile, so that neither Adam nor the norm
     that gradients are clipped to know of them. Where both share a features extractor, that belongs to the actor:
     ``policy_kwargs: {share_features_extractor: false}`` gives the value one of its own that learns from the beginning.

@@ -50,17 +50,64 @@ class PickCube(Expert):
     above, closing = False, 0
 
     def act(self) -> np.ndarray:
-        hand, cube, goal = map(self.position, (self.task.agent.tcp, self.task.cube, self.task.goal_site))
+        hand, cube = self.position(self.task.agent.tcp), self.position(self.task.cube)
         if self.closing >= 2:
-            return self.action(goal - cube, CLOSED)
+            return self.action(self.goal() - cube, CLOSED)
         if self.above and np.linalg.norm(hand - cube) < 0.012:
             self.closing += 1
             return self.action(cube - hand, CLOSED)
         self.above = self.above or bool(np.linalg.norm(hand[:2] - cube[:2]) < 0.01)
         return self.action(cube + np.array([0, 0, 0 if self.above else 0.08]) - hand, OPEN)
 
+    def goal(self) -> np.ndarray:
+        """:return: where the cube is to be, metres"""
+        return self.position(self.task.goal_site)
 
-EXPERTS: dict[str, type[Expert]] = {"PickCube-v1": PickCube}
+
+class LiftCube(PickCube):
+    """A little higher than asked for."""
+
+    def goal(self) -> np.ndarray:
+        return self.position(self.task.goal_site) + np.array([0, 0, 0.01])
+
+
+class PushCube(Expert):
+    """With closed fingers down behind the cube, and along the line to the goal."""
+
+    #: Metres from the cube's middle to where the hand goes down, and above the table before that.
+    BEHIND, CLEARANCE = 0.05, 0.12
+    #: Which way the goal lies, in the table's plane.
+    AHEAD = np.array([1.0, 0.0, 0.0])
+    down = False
+
+    def act(self) -> np.ndarray:
+        hand, cube, goal = map(self.position, (self.task.agent.tcp, self.task.obj, self.task.goal_region))
+        ahead, behind = self.AHEAD, cube - self.BEHIND * self.AHEAD
+        self.down = self.down or bool(np.linalg.norm(hand[:2] - behind[:2]) < 0.015)
+        if not self.down:
+            # up first where the cube is in the way
+            free = hand[2] > self.CLEARANCE - 0.03 or (hand - behind) @ ahead < 0.02
+            return self.action((np.array([*behind[:2], self.CLEARANCE]) - hand) * ([1, 1, 1] if free else [0, 0, 1]), CLOSED)
+        lower = np.array([0, 0, self.task.cube_half_size - hand[2]])
+        if abs(lower[2]) > 0.02:
+            return self.action(lower + (behind - hand) * [1, 1, 0], CLOSED)
+        left = float((goal - cube) @ ahead)
+        sideways = (cube - hand) * [1, 1, 0]
+        return self.action(lower + sideways - (sideways @ ahead) * ahead + (left if left > 0.01 else 0.0) * ahead, CLOSED)
+
+
+class PullCube(PushCube):
+    """The same from the other side."""
+
+    AHEAD = -PushCube.AHEAD
+
+
+EXPERTS: dict[str, type[Expert]] = {
+    "PickCube-v1": PickCube,
+    "LiftCube-v1": LiftCube,
+    "PushCube-v1": PushCube,
+    "PullCube-v1": PullCube,
+}
 """By ManiSkill's names of the tasks."""
 
 
