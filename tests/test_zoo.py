@@ -412,7 +412,8 @@ def test_policies_of_other_algorithms_are_refused(algo: str, tmp_path: Path) -> 
     entry = read_entries(config_folder() / "cpm_sac.yml")["default"]
     path = tmp_path / f"my_{algo}.yml"
     path.write_text(yaml.safe_dump({"default": {key: value for key, value in entry.items() if key != "ent_coef"}}))
-    with pytest.raises(ValueError, match=f"PointNetPolicy is a policy of sac, rlpd, not of {algo}.*take policy: MultiInputPolicy"):
+    message = f"PointNetPolicy is a policy of sac, rlpd, not of {algo}.*take policy: MultiInputPolicy"
+    with pytest.raises(ValueError, match=message):
         load_agent(path, TOY)
     advised = {"policy": "MultiInputPolicy", "policy_kwargs": "dict(features_extractor_class=PointNetExtractor)"}
     built = load_agent(path, TOY, advised).build(0, device="cpu")
