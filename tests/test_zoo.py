@@ -149,7 +149,7 @@ SHORT = {
 
 
 def short(name: str) -> dict[str, Any]:
-    return SHORT["ppo" if name.startswith("ppo") else "off-policy"]
+    return SHORT["ppo" if "ppo" in name or name == "dapg" else "off-policy"]
 
 
 @pytest.mark.parametrize("name", [path.stem for path in CONFIGS if path.stem != "sac_her"])
