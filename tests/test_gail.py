@@ -28,6 +28,8 @@ from sb3_cpm.imitation import (
     VectorDiscriminator,
     record_demonstrations,
 )
+from sb3_cpm.run import train
+from sb3_cpm.training_env import begin_episodes
 
 N_POINTS = 40
 CLOUDS = spaces.Dict(
@@ -317,6 +319,38 @@ def test_successes_join_the_expert_up_to_the_first_successful_step() -> None:
         model.learn(1500, callback=callback)
     assert callback.n_successes == len(added) > 0 and {name for name, _ in added} <= {"strong", "medium", "weak"}
     assert sum(callback.expert.sizes().values()) == 180 + sum(n for _, n in added)
+
+
+def test_episodes_that_are_cut_off_between_rollouts_are_nobodys(demonstrations: Any) -> None:
+    callback, model = gail(demonstrations), make(reach())
+    model.learn(400, callback=[callback, Look(begin_episodes, at=200), Look(begin_episodes, at=300)])
+    lengths = [episode.length for episode in model.replay_buffer.episodes]
+    assert 20 in lengths and 10 in lengths  # cut off at steps 200 and 300
+    assert all(episode.length == 30 for episode in callback._round)
+    assert int(callback.discriminator.updates) == 5 * (lengths.count(30) // 2)
+
+
+def test_the_newest_of_a_round_come_last(demonstrations: Any) -> None:
+    callback = gail(demonstrations, episodes_per_round=100)
+    make(reach()).learn(200, callback=callback)
+    assert [episode.ordinal for episode in callback._round] == list(range(6))
+
+
+def test_a_run_that_was_cut_off_goes_on(tmp_path: Path) -> None:
+    small: dict[str, Any] = {"env": "CPMReach-v0", "agent": "gail_sac", "steps": 400, "evaluations": 2, "eval_episodes": 1}
+    small |= {"checkpoint_freq": 100, "video": False, "device": "cpu"}
+
+    def fail(model: Any) -> None:
+        raise KeyError("somebody else's")
+
+    train(run_folder=str(tmp_path / "unbroken"), **small)
+    with pytest.raises(KeyError):
+        train(run_folder=str(tmp_path / "broken"), **small, callback=Look(fail, at=250))
+    assert train(resume=str(tmp_path / "broken")).outcome == "finished"
+    broken, unbroken = (
+        {path.name: path.read_bytes() for path in sorted((tmp_path / name).glob("*.csv"))} for name in ("broken", "unbroken")
+    )
+    assert broken == unbroken and b"gail/" in broken["diagnostics.csv"]
 
 
 @pytest.mark.parametrize("algorithm", [SAC, TD3])

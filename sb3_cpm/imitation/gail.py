@@ -7,6 +7,7 @@ who is joined by the player's own successes.
 import math
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,13 +65,11 @@ class Played:
     An episode of the player that has ended.
 
     :param env_idx: environment that it was played in
-    :param length: number of transitions
     :param first_success: step that led to the first success; None without
     :param instance: which object it was about, as the environment names it
     """
 
     env_idx: int
-    length: int
     first_success: int | None
     instance: str | None
 
@@ -210,7 +209,6 @@ class GAILCallback(StatefulCallback):
         self.n_successes = 0
         self._round: list[Episode] = []
         self._played: list[Played] = []
-        self._lengths: list[int] = []  # of the running episodes
         self._first_success: list[int | None] = []
         self._told: set[str] = set()
 
@@ -247,8 +245,7 @@ class GAILCallback(StatefulCallback):
         elif isinstance(buffer, CPMBuffer) and self.demonstrations_for_player and buffer.demonstrations is None:
             warnings.warn("The player's buffer has none of the demonstrations that the discriminator knows.", stacklevel=2)
         self.discriminator.plan(self._planned_updates())
-        n_envs = model.n_envs
-        self._lengths, self._first_success = [0] * n_envs, [None] * n_envs
+        self._first_success = [None] * model.n_envs
         self._played = []
         buffer.attach_reward(self.player_rewards, self.discriminator.keys, lambda: _learns(model))
 
@@ -340,8 +337,11 @@ class GAILCallback(StatefulCallback):
     # ------------------------------------------------------------------ what it learns from
 
     def _on_step(self) -> bool:
+        books = self.buffer.books  # which SB3 is about to give this transition
         for i, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
-            self._lengths[i] += 1
+            step = books.n_steps - int(books.began[i])  # of its episode
+            if step == 0:  # the one before may have been cut off, by a checkpoint for instance
+                self._first_success[i] = None
             success = info.get("is_success", info.get("success"))
             if success is None and self.self_imitation:
                 raise ValueError(
@@ -349,10 +349,9 @@ class GAILCallback(StatefulCallback):
                     "'is_success' nor 'success'. Wrap it in one that adds it, or give GAILCallback self_imitation=False."
                 )
             if success and self._first_success[i] is None:
-                self._first_success[i] = self._lengths[i] - 1
+                self._first_success[i] = step
             if done:
-                self._played.append(Played(i, self._lengths[i], self._first_success[i], info.get("instance")))
-                self._lengths[i], self._first_success[i] = 0, None
+                self._played.append(Played(i, self._first_success[i], info.get("instance")))
                 if self.reward == "softplus" and not info.get("TimeLimit.truncated", False):
                     self._warn_of_ends("episodes of the player")
         return True
@@ -372,13 +371,11 @@ class GAILCallback(StatefulCallback):
     def _take_episodes(self) -> None:
         """Those that ended in this rollout: they are the newest of their environments."""
         assert self.expert is not None and self.discriminator is not None
-        newest: dict[int, list[Episode]] = {}
-        for episode in self.buffer.episodes:
-            newest.setdefault(episode.env_idx, []).append(episode)
-        for played in reversed(self._played):
-            episode = newest[played.env_idx].pop()
-            assert episode.length == played.length
-            self._round.insert(0, episode)
+        ended = Counter(played.env_idx for played in self._played)
+        newest = {env_idx: iter(self.buffer.books.newest(env_idx, n)) for env_idx, n in ended.items()}
+        for played in self._played:
+            episode = next(newest[played.env_idx])
+            self._round.append(episode)
             if self.self_imitation and played.first_success is not None:
                 n = played.first_success + 1
                 states = self.buffer.episode_observations(episode, self.discriminator.keys)
