@@ -98,14 +98,9 @@ def make_parser() -> argparse.ArgumentParser:
     two_stage.add_argument("--eval-episodes", type=int, default=100, help="episodes of each (default: 100)")
     two_stage.add_argument("--test-episodes", type=int, default=100, help="episodes of the last one (default: 100)")
     two_stage.add_argument("--device", default="auto", help="PyTorch device (default: auto)")
-    for flag, text in (
-        (
-            "--second",
-            "what differs in stage two, as n_steps=4375 batch_size=297 (default: 7/8 of n_steps, 9/10 of batch_size)",
-        ),
-        ("--overrides", "entries that win over those of the agent's file"),
-    ):
-        two_stage.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
+    changes = "what differs in stage two, as n_steps=4375 batch_size=297 (default: 7/8 of n_steps, 9/10 of batch_size)"
+    _add_key_values(two_stage, "--second", changes)
+    _add_key_values(two_stage, "--overrides", "entries that win over those of the agent's file")
     two_stage.set_defaults(command=_two_stage)
 
     demonstrate = commands.add_parser(
@@ -122,9 +117,7 @@ def make_parser() -> argparse.ArgumentParser:
     demonstrate.add_argument("--n-envs", type=int, default=1, help="parallel environments (default: 1)")
     demonstrate.add_argument("--hold", action="store_true", help="go on to the end of each episode, holding what was reached")
     demonstrate.add_argument("--overwrite", action="store_true", help="replace a file that is there")
-    demonstrate.add_argument(
-        "--env-kwargs", nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help="arguments of the environment"
-    )
+    _add_key_values(demonstrate, "--env-kwargs", "arguments of the environment")
     demonstrate.set_defaults(command=_demonstrate)
 
     watch = commands.add_parser(
@@ -202,7 +195,7 @@ def _add_option(parser: argparse.ArgumentParser, setting: "Field[Any]", text: st
     """An option for a setting of :class:`TrainSettings`, with its documentation."""
     flag = "--" + setting.name.replace("_", "-")
     if setting.default_factory is not MISSING:  # the dicts
-        parser.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
+        _add_key_values(parser, flag, text)
         return
     default = setting.default
     shown = "" if default is None else f" (default: {default})"
@@ -213,6 +206,11 @@ def _add_option(parser: argparse.ArgumentParser, setting: "Field[Any]", text: st
     choices = CHOICES.get(setting.name)
     metavar = None if choices else kind.__name__.upper()
     parser.add_argument(flag, type=kind, default=default, choices=choices, metavar=metavar, help=text + shown)
+
+
+def _add_key_values(parser: argparse.ArgumentParser, flag: str, text: str) -> None:
+    """An option that makes a dict."""
+    parser.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
 
 
 class _KeyValues(argparse.Action):

@@ -38,6 +38,7 @@ from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import Archive, LockedError, NotFiniteError, NotWrittenError, disk_errors_named, locked
 from sb3_cpm.packing import unpack
 from sb3_cpm.randomness import restore_random_state
+from sb3_cpm.training_env import learns
 
 logger = logging.getLogger(__name__)
 
@@ -196,26 +197,17 @@ class _Listener:
         self.heard = False
         self._model = weakref.ref(model)  # where one stays behind, it keeps no model alive
         previous: Any = signal.getsignal(signal.SIGTERM)
-        while isinstance(previous, _Listener) and not previous.learns(sys._getframe()):
+        while isinstance(previous, _Listener) and not learns(previous._model(), sys._getframe()):
             previous = previous.previous  # that one was left behind by a learn() that failed
         self.previous: Any = signal.SIG_DFL if previous is None else previous  # None: not one of Python's
         signal.signal(signal.SIGTERM, self)
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
-        if self.learns(frame):
+        if learns(self._model(), frame):
             self.heard = True
         else:
             self.close()
             os.kill(os.getpid(), signum)
-
-    def learns(self, frame: FrameType | None) -> bool:
-        """:return: whether the model's ``learn()`` is what runs in this frame of the main thread"""
-        model = self._model()
-        while frame is not None:
-            if frame.f_code.co_name == "learn" and model is not None and frame.f_locals.get("self") is model:
-                return True
-            frame = frame.f_back
-        return False
 
     def close(self) -> None:
         """Put back what was there before."""

@@ -5,10 +5,12 @@ What SB3 loses or does not notice of the training environment while a rollout is
   stays clipped, and integers are cut off. Here it is noted before it gets there.
 * Others who use the environment, as a callback that evaluates in it. SB3 would go on from the observation that it had before;
   and beside a VecNormalize it asks only after the callbacks for what the last step gave.
+* What the infos say of success, and whether a ``learn()`` that ended in an exception is still running.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -180,3 +182,24 @@ def begin_episodes(model: BaseAlgorithm, env: VecEnv | None = None, counted: boo
     model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
     if normalize is not None:
         model._last_original_obs = normalize.get_original_obs()
+
+
+def success_of(info: Mapping[str, Any]) -> bool | None:
+    """:return: what an info says about success, None if nothing; gymnasium-robotics says ``success``, SB3 ``is_success``"""
+    told = info.get("is_success", info.get("success"))
+    return None if told is None else bool(told)
+
+
+def learns(model: BaseAlgorithm | None, frame: FrameType | None) -> bool:
+    """
+    An exception ends a ``learn()`` without telling callbacks; only the stack knows.
+
+    :param model: perhaps none any more
+    :param frame: where to look from, outwards
+    :return: whether the model's ``learn()`` is what runs there
+    """
+    while frame is not None:
+        if frame.f_code.co_name == "learn" and model is not None and frame.f_locals.get("self") is model:
+            return True
+        frame = frame.f_back
+    return False

@@ -115,6 +115,17 @@ def imported(module: str, env_id: str) -> None:
         raise ValueError(f"env={module}:{env_id}: {module} registers no {env_id!r}.{nearest(env_id, gym.registry)}")
 
 
+def imported_task(env: str) -> str:
+    """
+    :param env: what people call a task: its name, or ``MODULE:ID``
+    :return: its one name, see :func:`task_id`; its module is imported
+    :raises ValueError: see :func:`imported` and :func:`task_id`
+    """
+    module, _, name = env.rpartition(":")
+    imported(module, name)
+    return task_id(name)
+
+
 def task_id(name: str) -> str:
     """
     The one name of a task.

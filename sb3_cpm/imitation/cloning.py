@@ -8,8 +8,7 @@ trained where the actor reads through them.
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from sb3_cpm.buffers.demonstrations import as_arrays
 from sb3_cpm.dreamer.spaces import OBSERVATION
 from sb3_cpm.imitation.callback import demonstrations_for
 from sb3_cpm.imitation.loading import Source
+from sb3_cpm.imitation.progress import progress
 
 #: Evaluations on held-out episodes over all updates.
 N_EVALUATIONS = 50
@@ -363,7 +363,7 @@ class _Learner:
         best_entry: tuple[int, float, float | None] | None = None
         curve: list[tuple[int, float, float | None]] = []
         total, counted, started = th.zeros((), device=device), 0, time.perf_counter()
-        with _progress(n_updates if progress_bar else None) as show:
+        with progress(n_updates, "update", progress_bar) as show:
             for update in range(1, n_updates + 1):
                 if anneal:
                     optimizer.param_groups[0]["lr"] = learning_rate * (1 + math.cos(math.pi * (update - 1) / n_updates)) / 2
@@ -448,31 +448,6 @@ def _let_targets_follow(policy: BasePolicy, trained: Sequence[nn.Parameter]) -> 
                     follower.copy_(one)
             for counted, follower_counted in zip(net.buffers(), target.buffers(), strict=True):
                 follower_counted.copy_(counted)
-
-
-@contextmanager
-def _progress(total: int | None) -> Iterator[Callable[[int], Any]]:
-    if total is None:
-        yield lambda n: None
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit="update") as bar:
-        yield bar.update
-
-
-@contextmanager
-def frozen(parameters: Sequence[nn.Parameter]) -> Iterator[None]:
-    """
-    Optimizers pass over these meanwhile, and so does the norm that gradients are clipped to: they get no gradient.
-
-    :param parameters: of a policy
-    """
-    _set_trainable(parameters, False)
-    try:
-        yield
-    finally:
-        _set_trainable(parameters, True)
 
 
 def _set_trainable(parameters: Sequence[nn.Parameter], trainable: bool) -> None:

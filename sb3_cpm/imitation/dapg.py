@@ -19,12 +19,12 @@ from sb3_cpm.imitation.cloning import (
     ActionLoss,
     Arrays,
     DemonstratedRows,
-    frozen,
     make_rows,
     policy_gradient_parameters,
     read_arrays,
 )
 from sb3_cpm.imitation.loading import Source
+from sb3_cpm.world_model.networks import frozen
 
 
 class DAPG(PPO):
@@ -104,7 +104,7 @@ class DAPG(PPO):
     def train(self) -> None:
         self.rounds += 1
         warming = self.rounds <= self.critic_warmup
-        with frozen(policy_gradient_parameters(self.policy)) if warming else nullcontext():
+        with frozen(*policy_gradient_parameters(self.policy)) if warming else nullcontext():
             weight = 0.0 if warming else self.demo_coef * self.demo_decay ** (self.rounds - 1)
             self.logger.record("train/demo_coef", weight)
             with self._demonstrations_added(weight) if weight else nullcontext():

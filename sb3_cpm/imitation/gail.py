@@ -11,14 +11,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any, Literal
 
 import numpy as np
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cpm.arguments import (
@@ -45,6 +43,7 @@ from sb3_cpm.imitation.loading import Source
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.player import max_episode_steps
 from sb3_cpm.stateful import StatefulCallback
+from sb3_cpm.training_env import learns, success_of
 
 #: Expert rows that the scale of a discriminator's inputs is taken from.
 SCALE_ROWS = 4096
@@ -247,7 +246,7 @@ class GAILCallback(StatefulCallback):
         self.discriminator.plan(self._planned_updates())
         self._first_success = [None] * model.n_envs
         self._played = []
-        buffer.attach_reward(self.player_rewards, self.discriminator.keys, lambda: _learns(model))
+        buffer.attach_reward(self.player_rewards, self.discriminator.keys, lambda: learns(model, sys._getframe()))
 
     def _take_demonstrations(self) -> None:
         assert self.expert is not None
@@ -342,7 +341,7 @@ class GAILCallback(StatefulCallback):
             step = books.n_steps - int(books.began[i])  # of its episode
             if step == 0:  # the one before may have been cut off, by a checkpoint for instance
                 self._first_success[i] = None
-            success = info.get("is_success", info.get("success"))
+            success = success_of(info)
             if success is None and self.self_imitation:
                 raise ValueError(
                     "self_imitation needs to know which episodes succeed, and the environment's infos have neither "
@@ -576,13 +575,3 @@ def _check_model(model: Any) -> None:
             "VecNormalize normalizes rewards by the task's statistics, and the discriminator's are others: VecNormalize(env, "
             "norm_reward=False)."
         )
-
-
-def _learns(model: BaseAlgorithm, frame: FrameType | None = None) -> bool:
-    """Whether the model's ``learn()`` is running: an exception ends it without telling callbacks."""
-    frame = sys._getframe() if frame is None else frame
-    while frame is not None:
-        if frame.f_code.co_name == "learn" and frame.f_locals.get("self") is model:
-            return True
-        frame = frame.f_back
-    return False

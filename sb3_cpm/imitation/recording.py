@@ -20,6 +20,8 @@ from sb3_cpm.arguments import check, integer
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.dreamer.spaces import as_dict
 from sb3_cpm.exploration import without_exploration
+from sb3_cpm.imitation.progress import progress
+from sb3_cpm.training_env import success_of
 
 #: The expert's method.
 EXPERT = "expert_action"
@@ -60,7 +62,7 @@ def record_demonstrations(
     inner = _without_normalization(env)
     _check_expert(inner)
     recorder = _Recorder(inner.num_envs, n_episodes, hold)
-    with _statistics_kept(inner), _progress(n_episodes if progress_bar else None) as show:
+    with _statistics_kept(inner), progress(n_episodes, "episode", progress_bar) as show:
         if seed is not None:
             inner.seed(seed)
         observations = inner.reset()
@@ -167,12 +169,13 @@ def _row(observations: Any, i: int | None = None) -> dict[str, np.ndarray]:
 
 
 def _succeeded(info: dict[str, Any]) -> bool:
-    if "is_success" not in info and "success" not in info:
+    success = success_of(info)
+    if success is None:
         raise ValueError(
             "The environment does not tell whether it succeeded: its infos have neither 'is_success' nor 'success'. Wrap it "
             "in one that adds it."
         )
-    return bool(info.get("is_success", info.get("success")))
+    return success
 
 
 def _without_normalization(env: VecEnv) -> VecEnv:
@@ -193,17 +196,6 @@ def _check_expert(env: VecEnv) -> None:
             "A wrapper changes the actions on their way to the environment, whose expert gives what arrives there. Make the "
             "environment without it."
         )
-
-
-@contextlib.contextmanager
-def _progress(total: int | None) -> Iterator[Any]:
-    if total is None:
-        yield lambda n: None
-        return
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit="episode") as bar:
-        yield bar.update
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_cpm.agents import load_agent
-from sb3_cpm.agents.tasks import imported, task_id
+from sb3_cpm.agents.tasks import imported_task
 from sb3_cpm.arguments import check_each, integer
 from sb3_cpm.buffers.demonstrations import write_demonstrations
 from sb3_cpm.imitation import record_demonstrations
@@ -44,9 +44,7 @@ def demonstrate(
     :raises RuntimeError: if the expert fails too often
     """
     check_each(integer(1), episodes=episodes, n_envs=n_envs)
-    module, _, name = env.rpartition(":")
-    imported(module, name)
-    env_id = task_id(name)
+    env_id = imported_task(env)
     path = Path(output) if output is not None else Path("demos") / f"{env_id.replace('/', '-')}-{episodes}.h5"
     if path.suffix != ".h5":
         raise ValueError(f"output={str(path)!r}: demonstrations are written as ManiSkill's are, so its name ends with .h5.")

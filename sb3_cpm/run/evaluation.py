@@ -6,6 +6,7 @@ Unlike SB3's ``evaluate_policy`` it seeds every episode, and tells success at th
 """
 
 import copy
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_cpm.seeds import FIRST_SEED
+from sb3_cpm.training_env import success_of
 
 
 class Outcome(NamedTuple):
@@ -32,10 +34,10 @@ class Outcome(NamedTuple):
     success_at_end: bool | None
 
 
-def success_of(info: dict[str, Any]) -> bool | None:
-    """:return: what an info says about success, None if nothing; gymnasium-robotics says ``success``, SB3 ``is_success``"""
-    told = info.get("is_success", info.get("success"))
-    return None if told is None else bool(told)
+def means(outcomes: Sequence[Outcome]) -> tuple[float, float | None]:
+    """:return: mean return, and success rate at the end of the episodes, None where nobody says"""
+    told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
+    return float(np.mean([outcome.episode_return for outcome in outcomes])), float(np.mean(told)) if told else None
 
 
 def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int, first_seed: int = FIRST_SEED) -> list[Outcome]:

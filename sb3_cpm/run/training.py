@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cpm.agents import Agent, load_agent
 from sb3_cpm.agents.algorithms import algorithms
-from sb3_cpm.agents.tasks import imported, task_id
+from sb3_cpm.agents.tasks import imported, imported_task, task_id
 from sb3_cpm.extras import check_installed
 from sb3_cpm.files import locked
 from sb3_cpm.run import folder as run_folder
@@ -56,9 +56,7 @@ def specification(settings: TrainSettings) -> tuple[RunSpec, Agent]:
     :return: the run, and its agent
     :raises ValueError: for an unknown agent, task or hyperparameter (with the nearest), and a seed that evaluation has
     """
-    module, _, name = settings.env.rpartition(":")
-    imported(module, name)
-    env_id = task_id(name)
+    env_id = imported_task(settings.env)
     overrides = settings.overrides()
     agent = load_agent(settings.agent, env_id, overrides)
     check_seed(settings.seed, agent.n_envs)
@@ -75,7 +73,7 @@ def specification(settings: TrainSettings) -> tuple[RunSpec, Agent]:
         eval_every=-(-steps // (settings.evaluations - 1)) if settings.evaluations else 0,
         eval_episodes=settings.eval_episodes,
         checkpoint_every=settings.checkpoint_freq,
-        module=module,
+        module=settings.env.rpartition(":")[0],
     )
     check_length(spec, agent)
     return spec, agent

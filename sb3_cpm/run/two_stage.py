@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -21,11 +20,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.agents import load_agent
-from sb3_cpm.agents.tasks import imported, task_id
+from sb3_cpm.agents.tasks import imported_task
 from sb3_cpm.arguments import check, check_each, integer, number
 from sb3_cpm.files import locked, write_text
 from sb3_cpm.imitation import DAPG
-from sb3_cpm.run.evaluation import Outcome, evaluate
+from sb3_cpm.run.evaluation import Outcome, evaluate, means
 from sb3_cpm.run.execution import check_device
 from sb3_cpm.seeds import FIRST_SEED, check_seed
 
@@ -169,9 +168,7 @@ def two_stage_agent(
     :raises ValueError: for an unknown agent, task or hyperparameter, and see there
     """
     check_device(device)
-    module, _, name = env.rpartition(":")
-    imported(module, name)
-    env_id = task_id(name)
+    env_id = imported_task(env)
     loaded = load_agent(agent, env_id, overrides)
     check_seed(seed, loaded.n_envs)
     built = loaded.build(seed, device=device, vec_env_type="robust" if loaded.n_envs > 1 else "dummy")
@@ -317,7 +314,8 @@ class _Training:
         """Evaluate the model as it is, and keep it if it is the best so far."""
         settings = self.settings
         outcomes = self.evaluation(self.model, self.eval_env, settings["eval_episodes"], SELECTION_SEED)
-        rated = Rated(self.stage, self.model.num_timesteps, *_means(outcomes))
+        mean_return, success = means(outcomes)
+        rated = Rated(self.stage, self.model.num_timesteps, success or 0.0, mean_return)
         self.table.append(rated)
         self.stale += 1
         if rated.better_than(self.best):
@@ -334,7 +332,8 @@ class _Training:
         assert best is not None and self.best is not None
         self._load(best)
         outcomes = self.evaluation(self.model, self.eval_env, self.settings["test_episodes"], FIRST_SEED)
-        success, mean_return = _means(outcomes)
+        mean_return, success = means(outcomes)
+        success = success or 0.0
         content = {
             **{"settings": self.settings, "best": self.best._asdict(), "success": success, "mean_return": mean_return},
             "table": [row._asdict() for row in self.table],
@@ -376,11 +375,6 @@ class _Stage(BaseCallback):
 
     def _on_step(self) -> bool:
         return not self.training._has_enough()
-
-
-def _means(outcomes: Sequence[Outcome]) -> tuple[float, float]:
-    told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
-    return float(np.mean(told)) if told else 0.0, float(np.mean([outcome.episode_return for outcome in outcomes]))
 
 
 def _second_settings(model: BaseAlgorithm) -> dict[str, Any]:

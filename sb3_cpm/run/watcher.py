@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import VecEnv
@@ -15,12 +14,13 @@ from sb3_cpm.agents import Built
 from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import DamagedFileError, DamagedRunError, NotFiniteError, NotWrittenError
 from sb3_cpm.run.diagnostics import DiagnosticsWriter
-from sb3_cpm.run.evaluation import evaluate, success_of
+from sb3_cpm.run.evaluation import evaluate, means
 from sb3_cpm.run.player_losses import log_player_losses
 from sb3_cpm.run.recorder import Recorder
 from sb3_cpm.run.specification import RunSpec
 from sb3_cpm.run.tables import COLUMNS, Table
 from sb3_cpm.stopwatch import Stopwatch
+from sb3_cpm.training_env import success_of
 
 #: How often diagnostics are written in a run.
 N_DUMPS = 50
@@ -183,9 +183,7 @@ class Watcher(BaseCallback):
         spec, step = self.spec, self.built.model.num_timesteps
         with self.stopwatch.section("evaluation"):
             outcomes = evaluate(self.built.model, self.eval_env, spec.eval_episodes, spec.eval_seed)
-        mean_return = float(np.mean([outcome.episode_return for outcome in outcomes]))
-        told = [outcome.success_at_end for outcome in outcomes if outcome.success_at_end is not None]
-        success = float(np.mean(told)) if told else None
+        mean_return, success = means(outcomes)
         self.logger.record("eval/mean_reward", mean_return)
         if success is not None:
             self.logger.record("eval/success_rate", success)

@@ -261,12 +261,13 @@ class Decoder(nn.Module):
 
 
 @contextmanager
-def frozen(*modules: nn.Module) -> Iterator[None]:
+def frozen(*parts: nn.Module | nn.Parameter) -> Iterator[None]:
     """
-    Context in which the weights of ``modules`` are constants: what is computed with them is differentiable with respect to its
-    inputs only, and nothing is computed for the weights.
+    Context in which parameters, and those of modules, are constants: what is computed with them is differentiable with respect
+    to its inputs only, and nothing is computed for the weights. Optimizers pass over them meanwhile.
     """
-    parameters = [parameter for module in modules for parameter in module.parameters() if parameter.requires_grad]
+    found = (one for part in parts for one in ([part] if isinstance(part, nn.Parameter) else part.parameters()))
+    parameters = [parameter for parameter in found if parameter.requires_grad]
     for parameter in parameters:
         parameter.requires_grad_(False)
     try:
