@@ -431,6 +431,11 @@ def test_bad_input(demonstrations: Any, wrong: Any, message: str) -> None:
         wrong(copy.copy(demonstrations))
 
 
+def test_arguments_in_a_file_are_checked_before_anything_is_built() -> None:
+    with pytest.raises(ValueError, match=r"CPMReach-v0, callback .*GAILCallback: gradient_steps must be"):
+        load_agent("gail_sac", "CPMReach-v0", {"callback": {"sb3_cpm.imitation.GAILCallback": {"gradient_steps": 0}}})
+
+
 def test_an_environment_that_does_not_tell_success() -> None:
     class Silent(gym.Wrapper):
         def step(self, action: Any) -> Any:

@@ -16,6 +16,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cpm.agents.algorithms import algorithms, evaluated
@@ -36,11 +37,9 @@ from sb3_cpm.arguments import (
 from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.buffers.checks import SET_BY_ALGORITHMS, check_values
 from sb3_cpm.buffers.cpm_buffer import ONE_STEP
-from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
-from sb3_cpm.imitation import CloneCallback
 from sb3_cpm.presets import make_preset
 from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
 
@@ -170,9 +169,9 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
 
 def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
     check_arguments(where, kwargs, taker)
-    if isinstance(taker, type) and issubclass(taker, (ChallengerCallback, CloneCallback)):
+    if isinstance(taker, type) and issubclass(taker, BaseCallback) and taker.__module__.startswith("sb3_cpm."):
         with error_prefix(where):
-            taker(**kwargs)  # checks its arguments, and makes nothing before learn()
+            taker(**kwargs)  # ours check their arguments, and make nothing before learn()
 
 
 def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:
