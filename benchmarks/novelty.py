@@ -123,8 +123,14 @@ def plot() -> None:
 
     rows = read(FOLDER)
     panels = (
-        ("novelty of transitions into new cells / into known ones", lambda row: float(row["new"]) / float(row["known"])),
-        ("imagined novelty: the actor's actions / random ones", lambda row: float(row["imagined"])),
+        (
+            "real transitions: novelty into new cells\nas a multiple of that into known ones",
+            lambda row: float(row["new"]) / float(row["known"]),
+        ),
+        (
+            "imagination: novelty of the actor's actions\nas a multiple of that of random ones",
+            lambda row: float(row["imagined"]),
+        ),
         ("cells visited, of 104", lambda row: float(row["cells"])),
     )
     with plt.rc_context(STYLE):
@@ -138,9 +144,9 @@ def plot() -> None:
                     axis.plot(steps, [one[index] for one in of_step], color=colour, alpha=0.25, lw=1)
             axis.set_title(title)
             axis.set_xlabel("environment steps")
-        for axis in axes[:2]:
+        for axis, upper in zip(axes[:2], (2.5, 1.25), strict=True):
             axis.axhline(1.0, color=GREY, lw=1, ls=":")
-            axis.set_ylim(bottom=0)
+            axis.set_ylim(0.75, upper)
         axes[0].legend(fontsize=9)
         save_figure(figure, FOLDER / "novelty.png")
 

@@ -246,6 +246,32 @@ def proposing(rounds: int) -> list[Result]:
     ]
 
 
+def telling(rounds: int) -> list[Result]:
+    """A quarter of each batch from challenges, whose rows say which challenge they are of."""
+    size, rng = 10_000, np.random.default_rng(0)
+    told = spaces.Dict({**GOAL_SPACE.spaces, "challenge": spaces.Box(-np.inf, np.inf, (26,), np.float32)})
+    kwargs = dict(device="cpu", mix="row", filter_kwargs=dict(novelty_tolerance=1e5, relevance_tolerance=1e5))
+    buffers = {
+        "Dict": make("Dict", size, told),
+        "untold": CPMBuffer(size, GOAL_SPACE, ACTION_SPACE, **kwargs),
+        "CPM": CPMBuffer(size, told, ACTION_SPACE, challenge_keys=["observation"], **kwargs),
+    }
+    for kind, buffer in buffers.items():
+        if kind != "Dict":
+            buffer.attach_challenger()
+        fill(buffer, size, told)
+        for episode in buffer.pop_completed() if kind != "Dict" else ():
+            states = rng.random((EPISODE + 1, 64), dtype=np.float32)
+            buffer.propose(episode, Evaluation(rng.random(EPISODE), rng.random(EPISODE), states))
+    times = alternate({kind: lambda b=b: b.sample(256) for kind, b in buffers.items()}, rounds, 20)
+    n_bytes = {kind: _bytes(buffer) / size for kind, buffer in buffers.items()}
+    return [
+        _row("sample(256), rows told their challenge, µs", times, "CPM", "Dict", at_most=1.5),
+        _row("the same, against rows that are not told, µs", times, "CPM", "untold"),
+        _row("bytes per transition, told and not", n_bytes, "CPM", "untold", at_most=1.0),
+    ]
+
+
 def _row(measure: str, values: dict[str, float], ours: str, theirs: str, at_most: float | None = None) -> Result:
     ratio = values[ours] / values[theirs]
     pair = f"{values[ours]:,.0f} | {values[theirs]:,.0f} ({theirs})"
@@ -262,7 +288,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--sizes", type=int, nargs="+", default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--only", nargs="+", choices=["sample", "images", "add", "memory", "propose"], default=None)
+    parser.add_argument("--only", nargs="+", choices=["sample", "images", "add", "memory", "propose", "tell"], default=None)
     arguments = parser.parse_args()
     th.set_num_threads(1)
     parts: dict[str, Callable[[], list[Result]]] = {
@@ -271,6 +297,7 @@ def main() -> int:
         "add": lambda: adding(arguments.rounds),
         "memory": memory,
         "propose": lambda: proposing(arguments.rounds),
+        "tell": lambda: telling(arguments.rounds),
     }
     print("| measure | CPMBuffer | against | ratio | target | met |\n| --- | --- | --- | --- | --- | --- |")
     missed = 0

@@ -26,27 +26,37 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_cpm.buffers import CPMBuffer
     from sb3_cpm.callbacks import ChallengerCallback
+    from sb3_cpm.challenge_env import ChallengeVecEnv
     from sb3_cpm.checkpoint_callback import CheckpointCPMCallback, resume
     from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
+    from sb3_cpm.policies import LayerNormPolicy, RLPDPolicy, SimbaPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
 __all__ = [
     "CPMBuffer",
+    "ChallengeVecEnv",
     "ChallengerCallback",
     "CheckpointCPMCallback",
+    "LayerNormPolicy",
     "PointNetExtractor",
     "PointNetPolicy",
+    "RLPDPolicy",
+    "SimbaPolicy",
     "__version__",
     "resume",
 ]
 
 _HOMES = {
     "CPMBuffer": "sb3_cpm.buffers",
+    "ChallengeVecEnv": "sb3_cpm.challenge_env",
     "ChallengerCallback": "sb3_cpm.callbacks",
     "CheckpointCPMCallback": "sb3_cpm.checkpoint_callback",
+    "LayerNormPolicy": "sb3_cpm.policies",
     "PointNetExtractor": "sb3_cpm.extractors",
     "PointNetPolicy": "sb3_cpm.extractors",
+    "RLPDPolicy": "sb3_cpm.policies",
+    "SimbaPolicy": "sb3_cpm.policies",
     "resume": "sb3_cpm.checkpoint_callback",
 }
 

@@ -1,5 +1,6 @@
 """
-The command line: ``python -m sb3_cpm train | watch | reproduce | doctor | setup-rendering | assets``.
+The command line: ``python -m sb3_cpm COMMAND``, of train, two-stage, demonstrate, watch, reproduce, doctor, setup-rendering
+and assets.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -79,6 +80,52 @@ def make_parser() -> argparse.ArgumentParser:
     documentation = field_documentation()
     for setting in fields(TrainSettings):
         _add_option(train, setting, documentation[setting.name].replace("%", "%%"))
+
+    two_stage = commands.add_parser(
+        "two-stage",
+        help="train an agent in two stages, the second from the first's best checkpoint",
+        description="Train an agent with evaluations, go on from the best checkpoint with shorter rounds and smaller batches, "
+        "and take the best of all. The same command goes on where it was cut off.",
+    )
+    two_stage.add_argument("agent", metavar="AGENT", help="the name of a file in zoo_configs/, or the path of one")
+    two_stage.add_argument("--env", required=True, help="a task, as for train")
+    two_stage.add_argument("--steps", type=int, help="of both stages together (default: as the agent's file says)")
+    two_stage.add_argument("--seed", type=int, default=0, help="rules both stages (default: 0)")
+    two_stage.add_argument("--folder", help="for checkpoints and result.json (default: below runs/)")
+    two_stage.add_argument("--split", type=float, default=0.5, help="share of the steps that are stage one's (default: 0.5)")
+    two_stage.add_argument("--patience", type=int, help="evaluations without a new best that end stage one (default: none)")
+    two_stage.add_argument("--eval-every", type=int, default=20_000, help="steps between evaluations (default: 20000)")
+    two_stage.add_argument("--eval-episodes", type=int, default=100, help="episodes of each (default: 100)")
+    two_stage.add_argument("--test-episodes", type=int, default=100, help="episodes of the last one (default: 100)")
+    two_stage.add_argument("--device", default="auto", help="PyTorch device (default: auto)")
+    for flag, text in (
+        (
+            "--second",
+            "what differs in stage two, as n_steps=4375 batch_size=297 (default: 7/8 of n_steps, 9/10 of batch_size)",
+        ),
+        ("--overrides", "entries that win over those of the agent's file"),
+    ):
+        two_stage.add_argument(flag, nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help=text)
+    two_stage.set_defaults(command=_two_stage)
+
+    demonstrate = commands.add_parser(
+        "demonstrate",
+        help="record demonstrations of a task's scripted expert",
+        description="Let the scripted expert of a task play, and write what an agent's training will see (cameras, cloud, "
+        "state) with actions and rewards into a file as ManiSkill has them, for add_demonstrations, clone and agents.",
+    )
+    demonstrate.add_argument("--env", required=True, help="a task, as for train")
+    demonstrate.add_argument("--episodes", type=int, default=200, help="with a success (default: 200)")
+    demonstrate.add_argument("--agent", default="bc_ppo", help="whose file says how the task is made (default: bc_ppo)")
+    demonstrate.add_argument("--output", metavar="FILE", help="the .h5 file (default: named after task and number, in demos/)")
+    demonstrate.add_argument("--seed", type=int, default=0, help="of the environments (default: 0)")
+    demonstrate.add_argument("--n-envs", type=int, default=1, help="parallel environments (default: 1)")
+    demonstrate.add_argument("--hold", action="store_true", help="go on to the end of each episode, holding what was reached")
+    demonstrate.add_argument("--overwrite", action="store_true", help="replace a file that is there")
+    demonstrate.add_argument(
+        "--env-kwargs", nargs="+", default={}, metavar="NAME=VALUE", action=_KeyValues, help="arguments of the environment"
+    )
+    demonstrate.set_defaults(command=_demonstrate)
 
     watch = commands.add_parser(
         "watch",
@@ -196,6 +243,23 @@ def _train(**settings: Any) -> int:
     with needed("Runs", "run"):
         from sb3_cpm.run.training import train
     train(TrainSettings(**settings))
+    return 0
+
+
+def _two_stage(agent: str, env: str, second: dict[str, Any], **arguments: Any) -> int:
+    with needed("Runs", "run"):
+        from sb3_cpm.run.signals import sigterm_raises
+        from sb3_cpm.run.two_stage import two_stage_agent
+    with sigterm_raises():
+        result = two_stage_agent(agent, env, second=second or None, tell=print, **arguments)
+    print(f"The model is {result.checkpoint / 'model.zip'}")
+    return 0
+
+
+def _demonstrate(**arguments: Any) -> int:
+    with needed("Recording", "run"):
+        from sb3_cpm.run.demonstrate import demonstrate
+    demonstrate(**arguments, progress_bar=sys.stderr.isatty(), tell=print)
     return 0
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_cpm.arguments import check, check_arguments, check_names, choice, integer, names_checked
+from sb3_cpm.arguments import SHARE, check, check_arguments, check_names, choice, integer, names_checked
 from sb3_cpm.buffers import CPMBuffer, Episode
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.challenges import CRITERIA, REWARD_TERMS, Proposal
@@ -69,6 +69,8 @@ class ChallengerCallback(BaseCallback):
     :param train_freq: number of environment steps (over all environments) between the challenger's updates; those that fall
         due in a rollout are made at its end
     :param gradient_steps: number of its updates then
+    :param demonstration_challenges: for each episode that ends, the probability that one of the demonstrations is proposed,
+        too, as a trajectory to cut a challenge from
     :param load_path: a challenger saved by :meth:`save` to start from
     :param device: PyTorch device of the challenger; "auto": the model's
     :param verbose: as SB3's callbacks have it; this one says nothing of its own
@@ -91,6 +93,7 @@ class ChallengerCallback(BaseCallback):
         segment_length: int = 20,
         train_freq: int = 8,
         gradient_steps: int = 1,
+        demonstration_challenges: float = 0.0,
         load_path: str | Path | None = None,
         device: th.device | str = "auto",
         verbose: int = 0,
@@ -100,6 +103,7 @@ class ChallengerCallback(BaseCallback):
             raise ValueError(_PARENTHESES)
         check("train_freq", train_freq, integer(1))
         check("gradient_steps", gradient_steps, integer(0))
+        check("demonstration_challenges", demonstration_challenges, SHARE)
         check("unit", unit, choice("step", "segment", "episode"))
         check("segment_length", segment_length, integer(1))
         check_arguments("decay_kwargs", decay_kwargs, make_decay, excluded=("decay",))
@@ -121,6 +125,7 @@ class ChallengerCallback(BaseCallback):
         self.segment_length = segment_length
         self.train_freq = train_freq
         self.gradient_steps = gradient_steps
+        self.demonstration_challenges = demonstration_challenges
         self.load_path = load_path
         self.device = device
 
@@ -170,7 +175,7 @@ class ChallengerCallback(BaseCallback):
         """What it was made with: ``ChallengerCallback(**callback.arguments)`` is one like it, with a new challenger."""
         names = (
             *("preset", "keys", "uncertainty_class", "uncertainty_kwargs", "challenger_kwargs", "decay_steps", "unit"),
-            *("segment_length", "train_freq", "gradient_steps", "load_path", "device", "verbose"),
+            *("segment_length", "train_freq", "gradient_steps", "demonstration_challenges", "load_path", "device", "verbose"),
         )
         decay = self.decay.arguments if isinstance(self.decay, Decay) else {"decay": self.decay}
         return {**{name: getattr(self, name) for name in names}, **decay}
@@ -392,7 +397,7 @@ class ChallengerCallback(BaseCallback):
         episodes = self.buffer.pop_completed()
         self.buffer.remember_call(episodes)
         self._warn_of_short(episodes)
-        for episode in episodes:
+        for episode in [*episodes, *self._drawn_demonstrations(len(episodes))]:
             if self.challenger.trained_updates == 0:
                 with self.stopwatch.section("bookkeeping"):
                     self.buffer.remember_reward(episode)  # what an untrained model says about novelty is noise
@@ -403,6 +408,14 @@ class ChallengerCallback(BaseCallback):
                 if proposal is not None:
                     self.proposals.append((episode, proposal))
                     self._log_proposal(proposal)
+
+    def _drawn_demonstrations(self, n_episodes: int) -> list[Episode]:
+        """Beyond the report: demonstrations to propose from, beside so many episodes."""
+        assert self.challenger is not None
+        if not self.demonstration_challenges or not self.challenger.trained_updates:
+            return []
+        n = np.random.binomial(n_episodes, self.demonstration_challenges)
+        return [self.buffer.draw_demonstration() for _ in range(n)]
 
     def _warn_of_short(self, episodes: Sequence[Episode]) -> None:
         """Now and then one is no matter; where all are, there will never be a challenge, and nothing else would tell."""
@@ -420,7 +433,7 @@ class ChallengerCallback(BaseCallback):
                 )
 
     def _evaluate(self, episode: Episode) -> Evaluation:
-        """What the challenger, as it is now, thinks of an episode that is still in D."""
+        """What the challenger, as it is now, thinks of an episode that is still in D, or of a demonstration."""
         assert self.challenger is not None
         with self.stopwatch.section("bookkeeping"):
             observations = self.buffer.episode_observations(episode, self.challenger.keys)

@@ -41,6 +41,7 @@ from sb3_cpm.files import (
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.randomness import random_state
 from sb3_cpm.seeds import FIRST_SEED
+from sb3_cpm.stateful import StatefulCallback
 from sb3_cpm.training_env import begin_episodes
 
 NAME = "checkpoint"
@@ -58,7 +59,7 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, callbacks: Sequence[Base
 
     :param folder: of the run, which is there
     :param model: with its replay buffer, where it has one; between two rollouts, so that the last one is in it
-    :param callbacks: challengers among them are saved
+    :param callbacks: challengers and others with a state are saved
     :param extra: plain data to be given back by :func:`load_extra`
     :raises NotWrittenError: if the disk does not take it; the last one stays
     :raises NotFiniteError: if a weight is not finite; the last one stays, too
@@ -114,6 +115,9 @@ def _write(new: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback], e
         storable, rest = _storable(callback.arguments)
         progress = callback.state_dict()["progress"]
         content["challengers"][str(index)] = {"arguments": storable, "not stored": rest, "progress": pack(progress)}
+    for index, other in enumerate(callbacks):
+        if isinstance(other, StatefulCallback) and other.has_state:
+            other.save(new / _callback_file(index))
     content["files"] = [STATE, *(path.name for path in sorted(new.iterdir()))]
     write_archive(new / STATE, content, arrays)  # the last one: where it is, all are
 
@@ -126,6 +130,10 @@ def _challengers(callbacks: Sequence[BaseCallback]) -> list[tuple[int, Challenge
 
 def _challenger_file(index: int) -> str:
     return f"challenger{index}.pt"
+
+
+def _callback_file(index: int) -> str:
+    return f"callback{index}.npz"
 
 
 def _storable(arguments: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -224,6 +232,11 @@ def restore(checkpoint: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCall
         assert callback.challenger is not None
         callback.challenger.load_state(checkpoint / _challenger_file(int(index)))
         callback.load_state_dict({"challenger": None, "progress": unpack(entry["progress"])})
+    for index, callback in enumerate(callbacks):
+        path = checkpoint / _callback_file(index)
+        if isinstance(callback, StatefulCallback) and path.exists():
+            callback.init_callback(model)
+            callback.load(path)
 
 
 def restore_buffer(checkpoint: Path, model: BaseAlgorithm) -> None:

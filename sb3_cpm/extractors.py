@@ -193,16 +193,23 @@ class PointNetExtractor(BaseFeaturesExtractor):
         return th.cat(parts, dim=1)
 
 
-class _ThriftyCritic(ContinuousCritic):
+class FrugalCritic(ContinuousCritic):
     """SB3's critic, which also builds the extractor's graph where its gradients are thrown away: same numbers, less work."""
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    def features(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        :param obs: shape ``(batch, *obs_shape)``
+        :param actions: that are to be rated with them
+        :return: shape ``(batch, features_dim)``, with a graph where somebody wants its gradients
+        """
         # Two cases need no graph: targets (SB3 computes them within `no_grad`, but its critic switches gradients on again),
         # and the actor's loss (the actions carry a gradient, and SB3 clears the critic's before its next step).
         wanted = th.is_grad_enabled() and not self.share_features_extractor and not actions.requires_grad
         with th.set_grad_enabled(wanted):
-            features = self.extract_features(obs, self.features_extractor)
-        q_value_input = th.cat([features, actions], dim=1)
+            return self.extract_features(obs, self.features_extractor)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        q_value_input = th.cat([self.features(obs, actions), actions], dim=1)
         return tuple(q_net(q_value_input) for q_net in self.q_networks)
 
 
@@ -235,7 +242,7 @@ class PointNetPolicy(MultiInputPolicy):
         )
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        return _ThriftyCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+        return FrugalCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """As in SB3, but keys that the extractor doesn't read are neither copied nor moved to the device."""

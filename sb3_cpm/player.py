@@ -14,6 +14,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_cpm.buffers import CPMBuffer
+from sb3_cpm.challenge_env import check_outermost
+from sb3_cpm.spaces import CHALLENGE
 
 
 def check_model(model: Any) -> None:
@@ -36,6 +38,7 @@ def check_model(model: Any) -> None:
             f"ChallengerCallback needs a CPMBuffer, but {name} has a {type(model.replay_buffer).__name__}: make it with "
             f'{name}("MultiInputPolicy", env, replay_buffer_class=CPMBuffer)'
         )
+    check_outermost(model.env)
     given = model.replay_buffer.player_keys
     if given is None:
         return
@@ -110,6 +113,8 @@ def original_space(model: BaseAlgorithm) -> spaces.Dict:
     """
     space, env = model.observation_space, model.get_vec_normalize_env()
     assert isinstance(space, spaces.Dict)
+    if getattr(getattr(model, "replay_buffer", None), "challenge_keys", None) is not None:  # that is between P and its buffer
+        space = spaces.Dict({key: part for key, part in space.spaces.items() if key != CHALLENGE})
     if env is None or not env.norm_obs:
         return space
     given: Any = env.get_original_obs()

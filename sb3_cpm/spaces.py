@@ -3,6 +3,8 @@
 import numpy as np
 from gymnasium import spaces
 
+#: Key of the observations that says which challenge the player plays.
+CHALLENGE = "challenge"
 #: What a point cloud has at least, in points, and at most, in features of a point (xyz, normals, colours, labels). Arrays of
 #: another shape are taken for something else as well, such as the last states one upon another.
 FEWEST_POINTS, MOST_FEATURES = 32, 16

@@ -183,7 +183,7 @@ def test_thrifty_critic_trains_like_that_of_sb3(monkeypatch: pytest.MonkeyPatch)
         return model.policy.parameters_to_vector()
 
     thrifty = parameters_after_training()
-    monkeypatch.setattr("sb3_cpm.extractors._ThriftyCritic", ContinuousCritic)
+    monkeypatch.setattr("sb3_cpm.extractors.FrugalCritic", ContinuousCritic)
     assert np.allclose(thrifty, parameters_after_training(), atol=1e-6)
 
 

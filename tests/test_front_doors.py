@@ -18,6 +18,7 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from rl_zoo3 import exp_manager
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cpm import ChallengerCallback
 from sb3_cpm.agents import Agent, load_agent
@@ -44,6 +45,8 @@ def plain(value: Any) -> Any:
         return {key: plain(one) for key, one in value.items()}
     if isinstance(value, ChallengerCallback):
         return {name: plain(one) for name, one in value.arguments.items()}
+    if isinstance(value, BaseCallback):
+        return plain(vars(value))
     if isinstance(value, (list, tuple)):
         return [plain(one) for one in value]
     if isinstance(value, functools.partial):
@@ -193,8 +196,6 @@ def cut_off(tmp_path: Path) -> Path:
 
     class Stop(Exception):
         pass
-
-    from stable_baselines3.common.callbacks import BaseCallback
 
     class StopAt(BaseCallback):
         def _on_step(self) -> bool:

@@ -170,7 +170,8 @@ def test_the_readme_of_an_index_has_no_link_that_leads_nowhere(wheel: Path) -> N
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "notebooks/README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+    "page",
+    ["README.md", "CONTRIBUTING.md", "notebooks/README.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))],
 )
 def test_links_lead_somewhere(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")

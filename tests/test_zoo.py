@@ -72,7 +72,7 @@ def test_rl_zoo3_knows_our_names() -> None:
     assert before == {algo: HYPERPARAMS_SAMPLER[algo] for algo in search.PLAYERS}
     assert exp_manager.ExperimentManager.learn is method
     assert eval("CPMHerReplayBuffer", vars(exp_manager)) is CPMBuffer
-    assert (ALGOS["dreamer"], ALGOS["plan2explore"], ALGOS["sac"]) == (Dreamer, Plan2Explore, SAC)
+    assert (ALGOS["dreamer"], ALGOS["plan2explore"], ALGOS["sac"], ALGOS["rlpd"]) == (Dreamer, Plan2Explore, SAC, SAC)
 
 
 # ---------------------------------------------------------------------- the files
@@ -85,8 +85,8 @@ def test_entries_have_only_keys_that_somebody_takes(name: str, env_id: str) -> N
 
 
 def test_every_file_of_the_report_has_the_seven_tasks_and_a_default() -> None:
-    others = {"cpm_sac_quick", "cpm_td3", "cpm_tqc"}
-    assert len(CONFIGS) == 13
+    others = {"cpm_sac_quick", "cpm_td3", "cpm_tqc", "bc_ppo", "dapg", "rlpd", "cpm_rlpd", "sac_layernorm", "sac_simba"}
+    assert len(CONFIGS) == 19
     for path in CONFIGS:
         if path.stem in others:
             assert {"default", "CPM/PickCube-v1"} <= set(read_entries(path)), path
@@ -147,7 +147,8 @@ def test_default_entry_trains_on_a_dict_environment(name: str) -> None:
     built.model.learn(60, callback=built.callbacks)
     assert built.model._n_updates > 0
     if name.startswith("cpm"):
-        assert isinstance(built.callbacks[0], ChallengerCallback) and built.callbacks[0].challenger is not None
+        (challenger,) = (one for one in built.callbacks if isinstance(one, ChallengerCallback))
+        assert challenger.challenger is not None
     evaluation = built.make_eval_env()
     action, _ = built.model.predict(evaluation.reset(), deterministic=True)  # type: ignore[arg-type]
     evaluation.step(action)
@@ -877,6 +878,9 @@ def test_agents_stand_for_algorithm_and_file() -> None:
     assert complete("train", ["--env-kwargs", "a:'b=c'"]) == ["--env-kwargs", "a:'b=c'"]
     assert complete("train", ["--algo", "dreamer", "-conf", "my.yml"]) == ["--algo", "dreamer", "-conf", "my.yml"]
     assert complete("train", ["--algo", "sac"]) == ["--algo", "sac"]
+    rlpd = str(config_folder() / "rlpd.yml")
+    assert complete("train", ["--algo", "rlpd"]) == ["--algo", "rlpd", "--conf-file", rlpd]
+    assert complete("train", ["--agent", "cpm_rlpd"])[:2] == complete("enjoy", ["--agent", "cpm_rlpd"]) == ["--algo", "rlpd"]
     for option in ("--conf", "--c", "-c", "-conf=my.yml", "--conf-file=my.yml"):  # argparse takes them all
         assert str(config_folder() / "dreamer.yml") not in complete("train", ["--algo", "dreamer", option, "my.yml"]), option
 
@@ -971,11 +975,12 @@ CHAINS = {
         10,
     ),
     "dreamer": (OURS, "dreamer", TOY, 200, 100, ["learning_starts:100", "train_freq:50"], 50),
+    "cpm_rlpd": (OURS, "rlpd", TOY, 200, 100, ["learning_starts:100", "batch_size:8", "train_freq:4"], 50),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer"])
+@pytest.mark.parametrize("name", ["cpm_sac", pytest.param("ppo_rgbd", marks=pytest.mark.maniskill), "dreamer", "cpm_rlpd"])
 def test_train_enjoy_resume_plot(name: str, warm: Command, tmp_path: Path) -> None:
     program, algo, env_id, n_steps, n_more, parameters, length = CHAINS[name]
 

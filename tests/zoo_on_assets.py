@@ -5,6 +5,7 @@ the objects that some tasks download: ManiSkill reads where they are (``MS_ASSET
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rl_zoo3.exp_manager import ExperimentManager
@@ -15,11 +16,14 @@ from sb3_cpm.agents.tasks import ENV_IDS
 
 #: Tasks that are not about bringing an object to a place.
 GOALLESS = ("CPM/LiftCube-v1", "CPM/TurnFaucet-v1", "CPM/OpenCabinetDoor-v1")
+ONE_DEMONSTRATION = {"sb3_cpm.imitation.DemonstrationsCallback": {"n_episodes": 1}}
 #: What makes a round short.
-SHORT = {
+SHORT: dict[str, Any] = {
     "ppo_rgbd": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
     "ppo_pointcloud": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
     "cpm_sac_report": {"train_freq": 1},
+    "rlpd": {"callback": [ONE_DEMONSTRATION]},
+    "cpm_rlpd": {"callback": [ONE_DEMONSTRATION, "sb3_cpm.ChallengerCallback"]},
 }
 
 ENTRIES = [

@@ -6,6 +6,7 @@ evaluates in the namespace of its experiment manager (:data:`NAMES`).
 
 from typing import Any
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_cpm.arguments import nearest
@@ -13,16 +14,22 @@ from sb3_cpm.buffers import CPMBuffer
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor, PointNetPolicy
 from sb3_cpm.extras import needed
+from sb3_cpm.imitation import DAPG
+from sb3_cpm.policies import LayerNormPolicy, RLPDPolicy, SimbaPolicy
 
 NAMES: dict[str, Any] = {
     "CPMBuffer": CPMBuffer,
     # `enjoy` passes an environment to `load`, without which SB3 makes no such buffer, only if it reads "HerReplayBuffer"
     "CPMHerReplayBuffer": CPMBuffer,
+    "LayerNormPolicy": LayerNormPolicy,
     "PointNetExtractor": PointNetExtractor,
     "PointNetPolicy": PointNetPolicy,
+    "RLPDPolicy": RLPDPolicy,
+    "SimbaPolicy": SimbaPolicy,
 }
 
-ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore}
+#: RLPD is SAC with a policy and settings of its own, which its files have.
+ALGORITHMS: dict[str, Any] = {"dreamer": Dreamer, "plan2explore": Plan2Explore, "dapg": DAPG, "rlpd": SAC}
 
 
 def add_names() -> None:

@@ -40,6 +40,7 @@ from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
+from sb3_cpm.imitation import CloneCallback
 from sb3_cpm.presets import make_preset
 from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
 
@@ -89,7 +90,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     """
     where = f"{path}, {env_id}"
     algorithm = algorithms()[algo]
-    arguments = set(inspect.signature(algorithm.__init__).parameters) - {"self", "env", "seed", "device"}
+    arguments = (argument_names(algorithm) or set()) - {"env", "seed", "device"}
     check_names(where, hyperparameters, {*arguments, *ZOO_KEYS})
     missing = {key for key in ("policy", "n_timesteps") if hyperparameters.get(key) is None}
     if missing:
@@ -169,9 +170,9 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
 
 def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
     check_arguments(where, kwargs, taker)
-    if taker is ChallengerCallback:
+    if isinstance(taker, type) and issubclass(taker, (ChallengerCallback, CloneCallback)):
         with error_prefix(where):
-            ChallengerCallback(**kwargs)  # checks its arguments, and makes nothing before learn()
+            taker(**kwargs)  # checks its arguments, and makes nothing before learn()
 
 
 def _check_buffer(hyperparameters: Mapping[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 
+import sb3_cpm.envs.reach  # registers CPMReach-v0
 import sb3_cpm.envs.toy  # noqa: F401  (registers CPMToy-v0)
 from sb3_cpm.arguments import nearest
 from sb3_cpm.envs.maniskill.tasks import knows_task

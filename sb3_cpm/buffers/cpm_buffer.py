@@ -7,6 +7,7 @@ part of D that is never overwritten.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from sb3_cpm.buffers.checks import check_buffer_arguments, check_shares, checked
 from sb3_cpm.buffers.compact import StorageSpec
 from sb3_cpm.buffers.demonstrations import Demonstration, as_transitions, read_demonstrations
 from sb3_cpm.buffers.episode_buffer import NOT_SAVED, EpisodeBuffer
-from sb3_cpm.buffers.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer
+from sb3_cpm.buffers.imaginary import Challenge, ChallengeCounters, ImaginaryBuffer, ImaginaryRows
 from sb3_cpm.buffers.sequences import side_by_side
 from sb3_cpm.buffers.storage import Episode
 from sb3_cpm.challenges import ArtificialRewards, ChallengeCurator, OriginKind, Proposal
@@ -88,6 +89,9 @@ class CPMBuffer(EpisodeBuffer):
     :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
     :param player_keys: observation keys that batches for P hold. None: all keys, unless P's features extractor names
         those that it reads (``PointNetExtractor`` does), which the callback then passes on
+    :param challenge_keys: keys that make the goal of a challenge, where a
+        :class:`~sb3_cpm.challenge_env.ChallengeVecEnv` adds ``"challenge"`` to the observations: rows then tell P which
+        challenge they are of; None: those that the environment names
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
@@ -121,6 +125,7 @@ class CPMBuffer(EpisodeBuffer):
         storage_dtypes: dict[str, StorageSpec] | None = None,
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
+        challenge_keys: Sequence[str] | None = None,
     ):
         given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_buffer_arguments(
@@ -141,6 +146,7 @@ class CPMBuffer(EpisodeBuffer):
             storage_dtypes=storage_dtypes,
             memmap_dir=memmap_dir,
             player_keys=player_keys,
+            challenge_keys=challenge_keys,
         )
         self._given = given
         self.challenge_ratio = challenge_ratio
@@ -263,11 +269,25 @@ class CPMBuffer(EpisodeBuffer):
         n_ours = batch_size - n_demonstrated
         if not n_demonstrated:
             return self._sample_own(n_ours - n_imaginary, n_imaginary, env)
+        demonstrated = self.sample_demonstrations(n_demonstrated, env)
+        return _concatenate(self._sample_own(n_ours - n_imaginary, n_imaginary, env), demonstrated) if n_ours else demonstrated
+
+    def sample_demonstrations(self, batch_size: int, env: VecNormalize | None = None) -> DictReplayBufferSamples:
+        """
+        A batch of demonstrations alone; there must be some.
+
+        :param batch_size: number of transitions
+        :param env: associated VecEnv to normalize the observations and rewards
+        :return: as :meth:`sample`
+        """
+        return self._demonstrations_for_player().sample(batch_size, env)
+
+    def _demonstrations_for_player(self) -> EpisodeBuffer:
         assert self.demonstrations is not None
         # SB3 sets a loaded buffer's device, and knows nothing of a second one in it
         self.demonstrations.player_keys, self.demonstrations.device = self.player_keys, self.device
-        demonstrated = self.demonstrations.sample(n_demonstrated, env)
-        return _concatenate(self._sample_own(n_ours - n_imaginary, n_imaginary, env), demonstrated) if n_ours else demonstrated
+        self.demonstrations.attach_reward(self.reward_of, self.reward_keys)
+        return self.demonstrations
 
     def _shares(self, batch_size: int) -> tuple[int, int]:
         """:return: number of rows from I and from the demonstrations"""
@@ -294,9 +314,29 @@ class CPMBuffer(EpisodeBuffer):
         rows, envs = self.books.draw(n_original, n_virtual)
         if not n_imaginary:
             return self._read(rows, envs, n_virtual, env)
-        imaginary_rows, imaginary_envs, rewards, is_goal = self._imaginary.sample(n_imaginary, self.n_added)
-        rows, envs = np.concatenate([rows, imaginary_rows]), np.concatenate([envs, imaginary_envs])
-        return self._read(rows, envs, n_virtual, env, rewards, is_goal if self.terminal_goals else None)
+        drawn = self._imaginary.sample(n_imaginary, self.n_added)
+        if not drawn.demonstrated.any():
+            return self._read_with_challenges(self, rows, envs, n_virtual, drawn, env)
+        nothing, elsewhere = np.zeros(0, dtype=np.int64), drawn.of(demonstrated=True)
+        demonstrated = self._read_with_challenges(self._demonstrations_for_player(), nothing, nothing, 0, elsewhere, env)
+        ours = drawn.of(demonstrated=False)
+        if not len(rows) + len(ours.slots):
+            return demonstrated
+        return _concatenate(self._read_with_challenges(self, rows, envs, n_virtual, ours, env), demonstrated)
+
+    def _read_with_challenges(
+        self,
+        home: EpisodeBuffer,
+        rows: np.ndarray,
+        envs: np.ndarray,
+        n_virtual: int,
+        drawn: ImaginaryRows,
+        env: VecNormalize | None,
+    ) -> DictReplayBufferSamples:
+        """Transitions of a buffer, D or the demonstrations, and after them those of challenges that are cut from it."""
+        rows, envs = np.concatenate([rows, drawn.slots]), np.concatenate([envs, drawn.envs])
+        goals = None if self.challenge_keys is None else home.ring.locate(drawn.goal_slots, drawn.envs)
+        return home._read(rows, envs, n_virtual, env, drawn.rewards, drawn.is_goal if self.terminal_goals else None, goals)
 
     # ------------------------------------------------------------------ sequences for C
 
@@ -332,19 +372,32 @@ class CPMBuffer(EpisodeBuffer):
         """
         Choose a goal in an episode, filter, and keep the challenge in I if it passes.
 
-        :param episode: a complete episode that is still in D
+        :param episode: a complete episode that is still in D, or a demonstration, see :meth:`draw_demonstration`. What a
+            demonstration earns says nothing of what P does: reward memory and origin do not count it
         :param evaluation: the challenger's evaluation of it
         :return: what was decided; None if the episode is too short to have a transition that counts
         :raises ValueError: for an evaluation that does not fit the episode; nothing is changed then
         """
-        self._check_present(episode)
-        proposal = self.curator.propose(self.rewards[episode.slots(self.buffer_size), episode.env_idx], evaluation)
+        proposal = self.curator.propose(self.episode_rewards(episode), evaluation, remember=not episode.demonstrated)
         if proposal is None:
             return None
         self.counters.count(proposal)
         if proposal.accepted:
             self._imaginary.keep(episode, proposal, self.n_added)
         return proposal
+
+    def draw_demonstration(self) -> Episode:
+        """
+        :return: one of the demonstrations at random, for :meth:`propose`
+        :raises ValueError: if there are none
+        """
+        if self.demonstrations is None:
+            raise ValueError(
+                "There are no demonstrations to cut challenges from: add_demonstrations() adds some, and so does a "
+                "sb3_cpm.imitation.DemonstrationsCallback in learn(). Else leave out demonstration_challenges."
+            )
+        episodes = self.demonstrations.episodes
+        return replace(episodes[np.random.randint(len(episodes))], demonstrated=True)
 
     def due_for_refresh(self) -> list[Challenge]:
         """:return: the challenges whose rewards are at least ``refresh_every`` transitions old"""
@@ -374,14 +427,11 @@ class CPMBuffer(EpisodeBuffer):
 
     def remember_reward(self, episode: Episode) -> None:
         """Let an episode count for reward memory and origin without proposing a challenge (while C knows nothing yet)."""
-        self._check_present(episode)
-        self.curator.remember(self.rewards[episode.slots(self.buffer_size), episode.env_idx])
+        self.curator.remember(self.episode_rewards(episode))
 
     def remember_call(self, episodes: Sequence[Episode]) -> None:
         """Before the episodes of a rollout are proposed from: the reward memory may count them together [B.5.2]."""
-        for episode in episodes:
-            self._check_present(episode)
-        self.curator.remember_call([self.rewards[e.slots(self.buffer_size), e.env_idx] for e in episodes])
+        self.curator.remember_call([self.episode_rewards(episode) for episode in episodes])
 
     @property
     def challenges(self) -> list[Challenge]:
@@ -428,6 +478,7 @@ class CPMBuffer(EpisodeBuffer):
             goal_selection_strategy=self.goal_selection_strategy,
             storage_dtypes=self.storage_dtypes,
             memmap_dir=self.memmap_dir,
+            challenge_keys=self.challenge_keys,
         )
         if earlier is not None:
             for row in range(n_earlier):
@@ -436,6 +487,12 @@ class CPMBuffer(EpisodeBuffer):
             grown.add(*step)
         self.demonstrations = grown
         return len(source)
+
+    def _home(self, episode: Episode) -> EpisodeBuffer:
+        if not episode.demonstrated:
+            return super()._home(episode)
+        assert self.demonstrations is not None
+        return self.demonstrations._home(episode)
 
     # ------------------------------------------------------------------ environment, saving
 

@@ -7,6 +7,7 @@ Reads ManiSkill's trajectory files (``RecordEpisode``, or its solvers): ``name.h
 one, and the recorded actions are replayed in it, from the recorded seeds.
 """
 
+import io
 import json
 import logging
 import warnings
@@ -22,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cpm.arguments import error_prefix
 from sb3_cpm.extras import needed
+from sb3_cpm.files import write_bytes, write_text
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +89,11 @@ def read_demonstrations(
             if observations is not None and "rewards" in recorded:
                 episodes.append(
                     Demonstration(
-                        observations, recorded["actions"][:], recorded["rewards"][:], bool(recorded["terminated"][-1])
+                        observations,
+                        recorded["actions"][:],
+                        recorded["rewards"][:],
+                        bool(recorded["terminated"][-1]),
+                        record.get("instance"),
                     )
                 )
                 continue
@@ -105,6 +111,37 @@ def read_demonstrations(
     if not episodes:
         raise ValueError(f"{path}: no episode could be used. Is the environment the one that they were recorded in?")
     return episodes
+
+
+def write_demonstrations(
+    path: str | Path, episodes: Sequence[Demonstration], env_id: str, env_kwargs: Mapping[str, Any]
+) -> None:
+    """
+    As ManiSkill's files are, with observations, rewards and the instance: :func:`read_demonstrations` needs no environment.
+
+    :param path: the ``.h5`` file; the ``.json`` of the same name is written, too, after it
+    :param episodes: to write
+    :param env_id: ManiSkill's or gymnasium's name of the task
+    :param env_kwargs: what it was made with, plain data
+    :raises NotWrittenError: if the disk does not take it; nothing is there then
+    """
+    path = Path(path)
+    with needed("ManiSkill's trajectory files", "demonstrations"):
+        import h5py
+    index: dict[str, Any] = {"env_info": {"env_id": env_id, "env_kwargs": dict(env_kwargs)}, "episodes": []}
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        for number, episode in enumerate(episodes):
+            group = file.create_group(f"traj_{number}")
+            ends = np.zeros(len(episode.rewards), dtype=bool)
+            ends[-1] = True
+            group["actions"], group["rewards"] = episode.actions, np.asarray(episode.rewards, np.float32)
+            group["terminated"], group["truncated"] = ends & episode.terminated, ends & (not episode.terminated)
+            for key, array in episode.observations.items():
+                group.create_dataset(f"obs/{key}", data=array, compression="gzip" if array.ndim > 2 else None)
+            index["episodes"].append({"episode_id": number, "success": True, "instance": episode.instance})
+    write_bytes(path, content.getvalue())
+    write_text(path.with_suffix(".json"), json.dumps(index, indent=1) + "\n")
 
 
 def _read_index(path: Path) -> dict[str, Any]:
@@ -216,14 +253,30 @@ def as_transitions(
     episodes: Sequence[Demonstration], observation_space: spaces.Dict, action_space: spaces.Space
 ) -> list[tuple[Any, ...]]:
     """
+    :param episodes: demonstrations
+    :return: for each step, what a buffer's ``add()`` takes, for one environment; see :func:`as_arrays`
+    """
+    arrays = as_arrays(episodes, observation_space, action_space)
+    return [
+        step
+        for (observations, actions, rewards), episode in zip(arrays, episodes, strict=True)
+        for step in _steps(observations, actions, rewards, episode.terminated)
+    ]
+
+
+def as_arrays(
+    episodes: Sequence[Demonstration], observation_space: spaces.Dict, action_space: spaces.Space
+) -> list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
+    """
     Actions outside of their bounds, as those of a Gaussian policy are now and then, are clipped, as environments do with them;
     a warning counts them.
 
     :param episodes: demonstrations
-    :return: for each step, what a buffer's ``add()`` takes, for one environment
+    :return: for each its observations by key, shape ``(T + 1, ...)``, images as the space has them; actions within [-1, 1],
+        shape ``(T, action_dim)``; and rewards, shape ``(T,)``
     :raises ValueError: for shapes and values that cannot be, naming the demonstration, what came, and what to do
     """
-    steps: list[tuple[Any, ...]] = []
+    arrays = []
     n_clipped = np.zeros(len(episodes), dtype=np.int64)
     for number, episode in enumerate(episodes):
         with error_prefix(f"Demonstration {number} of {len(episodes)}"):
@@ -232,14 +285,14 @@ def as_transitions(
             rewards = _rewards(episode)
             observations = _observations(episode, len(rewards), observation_space)
             actions, n_clipped[number] = _actions(episode, len(rewards), action_space)
-        steps += _steps(observations, actions, rewards, episode.terminated)
+        arrays.append((observations, actions, rewards))
     if n_clipped.any():
         warnings.warn(
             f"Actions of demonstrations outside of {action_space} are clipped to it, as environments do: {n_clipped.sum()} "
             f"numbers, in {np.count_nonzero(n_clipped)} of {len(episodes)} demonstrations.",
             stacklevel=3,
         )
-    return steps
+    return arrays
 
 
 def _rewards(episode: Demonstration) -> np.ndarray:

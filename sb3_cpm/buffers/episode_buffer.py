@@ -9,7 +9,7 @@ import copy
 import inspect
 import pickle
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ from sb3_cpm.buffers.sequences import draw_starts, read_sequences
 from sb3_cpm.buffers.storage import Episode, Locations, NextObservationView, ObservationRing
 from sb3_cpm.files import Archive, DamagedFileError, write_archive
 from sb3_cpm.packing import pack, unpack
+from sb3_cpm.spaces import CHALLENGE
 from sb3_cpm.type_aliases import SequenceBatch
 
 #: Changes whenever a buffer of an earlier release could be misread: of one that was pickled, and of one in a file of ours.
@@ -54,6 +55,10 @@ NOT_SAVED = ("self", "__class__", "env", "device")
 # Bytes per transition of the books beside observations and actions: reward, done, timeout, ep_start, ep_length, final_slot
 _BOOKS = 3 * 4 + 2 * 8 + 4
 
+
+#: Observations by key (tensors on P's device, each of shape ``(n, *shape)``), actions within [-1, 1], shape
+#: ``(n, action_dim)``, and the environment's rewards, shape ``(n, 1)``, to those that P learns from, shape ``(n, 1)``.
+RewardFunction = Callable[[dict[str, th.Tensor], th.Tensor, th.Tensor], th.Tensor]
 
 #: Key of ``infos[i]`` with the next observation as the environment gave it. What SB3 calls the ``terminal_observation`` has
 #: been clipped by a VecNormalize, and integers are cut off when it is un-normalized.
@@ -83,6 +88,9 @@ class EpisodeBuffer(HerReplayBuffer):
         Batches hold the space's dtype as ever
     :param memmap_dir: keep the observations in files in a folder of their own there, for buffers larger than memory
     :param player_keys: observation keys that batches hold; None: all keys
+    :param challenge_keys: keys that make the goal of a challenge, where a
+        :class:`~sb3_cpm.challenge_env.ChallengeVecEnv` adds ``"challenge"`` to the observations; None: those that the
+        environment names
     :raises ValueError: for spaces and arguments that cannot work, and if it would take more memory than the machine has
     """
 
@@ -102,7 +110,10 @@ class EpisodeBuffer(HerReplayBuffer):
         storage_dtypes: dict[str, StorageSpec] | None = None,
         memmap_dir: str | Path | None = None,
         player_keys: Sequence[str] | None = None,
+        challenge_keys: Sequence[str] | None = None,
     ):
+        if challenge_keys is None:
+            challenge_keys = getattr(env, "challenge_keys", None)
         self._given = {name: value for name, value in locals().items() if name not in NOT_SAVED}
         check_spaces(observation_space, n_sampled_goal, player_keys)
         check_player_reads_images(observation_space)
@@ -125,7 +136,31 @@ class EpisodeBuffer(HerReplayBuffer):
         self.storage_dtypes = storage_dtypes
         self.memmap_dir = memmap_dir
         self.player_keys = None if player_keys is None else tuple(player_keys)
+        #: Keys that the goal of a challenge consists of; None where P is not told which challenge it plays.
+        self.challenge_keys = None if challenge_keys is None else tuple(challenge_keys)
+        self.attach_reward(None)
         self._allocate()
+
+    # ------------------------------------------------------------------ whose rewards P gets
+
+    def attach_reward(
+        self, function: RewardFunction | None, keys: Sequence[str] = (), is_on: Callable[[], bool] = lambda: True
+    ) -> None:
+        """
+        Give P other rewards, anew whenever it samples; those that are stored stay the environment's. Never saved.
+
+        :param function: to those rewards; None: P gets the environment's again
+        :param keys: observations that it reads, as the environment gave them, whether P reads them or not
+        :param is_on: whether that is still so: a ``learn()`` may have ended in an exception
+        """
+        self._reward = function
+        self._reward_is_on = is_on
+        self.reward_keys = tuple(keys)
+
+    @property
+    def reward_of(self) -> RewardFunction | None:
+        """What gives P its rewards in place of the environment, if anything does."""
+        return self._reward if self._reward is not None and self._reward_is_on() else None
 
     # ------------------------------------------------------------------ storage
 
@@ -133,7 +168,10 @@ class EpisodeBuffer(HerReplayBuffer):
         """Arrays for ``buffer_size`` transitions per environment, and empty books."""
         shape = (self.buffer_size, self.n_envs)
         assert isinstance(self.obs_shape, dict)
-        codecs = make_codecs(self.observation_space, self.obs_shape, self.storage_dtypes)
+        shapes = dict(self.obs_shape)
+        if self.challenge_keys is not None:  # follows from where a row is drawn from, and is never stored
+            del shapes[CHALLENGE]
+        codecs = make_codecs(self.observation_space, shapes, self.storage_dtypes)
         n_slots = self.buffer_size * self.n_envs
         n_bytes = {key: codec.nbytes * n_slots for key, codec in codecs.items()}
         in_files = 0 if self.memmap_dir is None else sum(n_bytes.values())
@@ -309,6 +347,7 @@ class EpisodeBuffer(HerReplayBuffer):
         env: VecNormalize | None = None,
         last_rewards: np.ndarray | None = None,
         last_is_goal: np.ndarray | None = None,
+        last_goals: Locations | None = None,
     ) -> DictReplayBufferSamples:
         """
         :param rows: slots of transitions, shape ``(n,)``
@@ -317,13 +356,17 @@ class EpisodeBuffer(HerReplayBuffer):
         :param env: normalizes observations and rewards
         :param last_rewards: rewards instead of the task's, for the last transitions
         :param last_is_goal: which of these end here
+        :param last_goals: the transitions that lead to the goals of the last ones' challenges
         """
         wanted = self._keys_for_player()
         at = self.ring.locate(rows, envs)
         # VecNormalize wants all the keys that it normalizes, hindsight the goals, whether P reads them or not
-        keys = wanted if env is None and not n_virtual else tuple(self.observations)
+        keys = [key for key in wanted if key in self.observations] if env is None and not n_virtual else [*self.observations]
+        reward_of = self.reward_of
+        if reward_of is not None:
+            keys += [key for key in self.reward_keys if key not in keys]
         obs: Any = {key: self.ring.read(key, at) for key in keys}
-        next_obs: Any = {key: self.ring.read_next(key, at) for key in keys}
+        next_obs: Any = {key: self.ring.read_next(key, at) for key in keys if key in wanted or env is not None or n_virtual}
         outcomes = self._outcomes.reshape(-1, 3).take(at.here, axis=0)
         rewards = outcomes[:, :1]
         dones = outcomes[:, 1:2] * (1 - outcomes[:, 2:])
@@ -337,17 +380,46 @@ class EpisodeBuffer(HerReplayBuffer):
             rewards[len(rewards) - len(last_rewards) :, 0] = last_rewards
         if last_is_goal is not None:
             dones[len(dones) - len(last_is_goal) :, 0][last_is_goal] = 1
+        tensor = self._tensor
+        actions = tensor(self.actions.reshape(-1, self.action_dim).take(at.here, axis=0))
+        if reward_of is not None:
+            with th.no_grad():
+                read = {key: tensor(obs[key]) for key in self.reward_keys}
+                given = reward_of(read, actions, tensor(np.ascontiguousarray(rewards)))
+            rewards = given.to(th.float32).cpu().numpy()
         if env is not None:
             obs, next_obs = env.normalize_obs(obs), env.normalize_obs(next_obs)
             rewards = self._normalize_reward(rewards, env)
-        tensor = self._tensor
+        if self.challenge_keys is not None and CHALLENGE in wanted:
+            obs[CHALLENGE] = next_obs[CHALLENGE] = self._challenges_of(len(rows), last_goals, env)
         return DictReplayBufferSamples(
             observations={key: tensor(obs[key]) for key in wanted},
-            actions=tensor(self.actions.reshape(-1, self.action_dim).take(at.here, axis=0)),
+            actions=actions,
             next_observations={key: tensor(next_obs[key]) for key in wanted},
             dones=tensor(dones),
             rewards=tensor(np.ascontiguousarray(rewards)),
         )
+
+    def _challenges_of(self, n: int, last_goals: Locations | None, env: VecNormalize | None) -> np.ndarray:
+        """
+        :param n: number of rows, of which the last ones are of challenges
+        :param last_goals: the transitions that lead to their goals
+        :param env: normalizes observations
+        :return: flag and goal, zeros for rows of the task, shape ``(n, 1 + goal_dim)``
+        """
+        assert self.challenge_keys is not None
+        shape = self.observation_space[CHALLENGE].shape
+        assert shape is not None
+        challenges = np.zeros((n, *shape), np.float32)
+        if last_goals is not None:
+            keys = self.challenge_keys if env is None else self.observations
+            goals: Any = {key: self.ring.read_next(key, last_goals) for key in keys}
+            if env is not None:
+                goals = env.normalize_obs(goals)
+            of_challenges = challenges[n - len(last_goals.here) :]
+            of_challenges[:, 0] = 1
+            np.concatenate([goals[key] for key in self.challenge_keys], axis=1, out=of_challenges[:, 1:], casting="same_kind")
+        return challenges
 
     def _tensor(self, fresh: np.ndarray) -> th.Tensor:
         """On P's device, sharing the memory of an array that is nobody else's."""
@@ -397,7 +469,7 @@ class EpisodeBuffer(HerReplayBuffer):
         return self._read(batch_indices, env_indices, len(batch_indices), env)
 
     def _keys_for_player(self) -> tuple[str, ...]:
-        return tuple(self.observations) if self.player_keys is None else self.player_keys
+        return tuple(self.observation_space.spaces) if self.player_keys is None else self.player_keys
 
     # ------------------------------------------------------------------ sequences for C, episodes
 
@@ -427,25 +499,35 @@ class EpisodeBuffer(HerReplayBuffer):
         :return: its states, one array of shape ``(length + 1, *observation_shape)`` per key
         :raises ValueError: if D has overwritten it
         """
-        self._check_present(episode)
-        slots = episode.slots(self.buffer_size)
-        at = self.ring.locate(slots, np.full(episode.length, episode.env_idx))
-        last = self.ring.locate(slots[-1:], np.array([episode.env_idx]))
+        home = self._home(episode)
+        slots = episode.slots(home.buffer_size)
+        at = home.ring.locate(slots, np.full(episode.length, episode.env_idx))
+        last = home.ring.locate(slots[-1:], np.array([episode.env_idx]))
         return {
-            key: np.concatenate([self.ring.read(key, at), self.ring.read_next(key, last)])
+            key: np.concatenate([home.ring.read(key, at), home.ring.read_next(key, last)])
             for key in (self.observations if keys is None else keys)
         }
 
     def episode_actions(self, episode: Episode) -> np.ndarray:
         """:return: executed actions of an episode that is still in D, within [-1, 1], shape ``(length, action_dim)``"""
-        self._check_present(episode)
-        return self.actions[episode.slots(self.buffer_size), episode.env_idx]
+        home = self._home(episode)
+        return home.actions[episode.slots(home.buffer_size), episode.env_idx]
 
-    def _check_present(self, episode: Episode) -> None:
+    def episode_rewards(self, episode: Episode) -> np.ndarray:
+        """:return: the task's rewards of an episode that is still in D, shape ``(length,)``"""
+        home = self._home(episode)
+        return home.rewards[episode.slots(home.buffer_size), episode.env_idx]
+
+    def _home(self, episode: Episode) -> "EpisodeBuffer":
+        """
+        :return: the buffer that an episode is in
+        :raises ValueError: if it is no longer there
+        """
         if not self.books.holds(episode):
             raise ValueError(
                 f"{episode} is no longer in the buffer, which holds {self.buffer_size} transitions per environment"
             )
+        return self
 
     @property
     def episodes(self) -> list[Episode]:
@@ -628,7 +710,8 @@ class EpisodeBuffer(HerReplayBuffer):
         state = super().__getstate__()
         for name in _VIEWS:  # made anew
             del state[name]
-        return {**state, "format": FORMAT}
+        del state["_reward"], state["_reward_is_on"]  # of a running learn()
+        return {**state, "reward_keys": (), "format": FORMAT}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         state = dict(state)
@@ -644,7 +727,9 @@ class EpisodeBuffer(HerReplayBuffer):
             arrays = {name: state.pop(f"_{name}") for name in books.state()[1]}
             books.restore(state.pop("_n_steps"), state.pop("_starts").items(), episodes, **arrays)
             del state["_valid_ends"], state["_earliest_began"]
+        state.setdefault("challenge_keys", None)  # pickled before there were any
         super().__setstate__(state)
+        self.attach_reward(None)
         self._link_views()
 
 

@@ -1,13 +1,14 @@
 """
 The imaginary buffer I: challenges as views into D (report, sections 3.2.1 and 4.3).
 
-A challenge holds positions in D, rewards of its own and what it was chosen for, no observations. It ends with its episode.
+A challenge holds positions in D, rewards of its own and what it was chosen for, no observations. It ends with its episode,
+or lives on among the demonstrations, which are never overwritten.
 """
 
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class Challenge:
     """
     A challenge in I: transitions ``first`` to ``goal`` of an episode, with artificial rewards.
 
-    :param episode: the episode in D that it is cut from
+    :param episode: the episode in D, or among the demonstrations, that it is cut from
     :param proposal: its evaluation and its rewards
     :param number: how many challenges were kept before it
     :param added_at: number of transitions that D had been given when it was kept
@@ -110,7 +111,7 @@ class ImaginaryBuffer:
 
     def keep(self, episode: Episode, proposal: Proposal, now: int) -> None:
         """
-        :param episode: the episode in D
+        :param episode: the episode in D, or among the demonstrations
         :param proposal: an accepted one
         :param now: number of transitions that D has been given
         """
@@ -143,19 +144,18 @@ class ImaginaryBuffer:
         """:return: the challenges, oldest first, their ages filled in"""
         return [replace(challenge, age=now - challenge.rewarded_at) for challenge in self._challenges]
 
-    def sample(self, n: int, now: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def sample(self, n: int, now: int) -> "ImaginaryRows":
         """
         :param n: number of transitions, drawn uniformly over all transitions of all challenges
         :param now: number of transitions that D has been given, for the ages
-        :return: slots, environments, rewards, and whether it leads to the goal, each of shape ``(n,)``
         """
         if self._index is None:
             self._index = _Index.of(self._challenges, self.buffer_size)
         index = self._index
-        picks = np.random.randint(len(index.slots), size=n)
+        picks = np.random.randint(len(index.rewarded_at), size=n)
         self._age_sum += now - float(index.rewarded_at.take(picks).mean())
         self._age_samples += 1
-        return index.slots.take(picks), index.envs.take(picks), index.rewards.take(picks), index.is_goal.take(picks)
+        return ImaginaryRows(*(column.take(picks) for column in index.rows))
 
     def state(self) -> dict[str, Any]:
         """All that it holds, for :meth:`restore`."""
@@ -176,14 +176,36 @@ class ImaginaryBuffer:
         return age
 
 
-@dataclass(frozen=True)
-class _Index:
-    """All transitions of I one after another, each array of shape ``(transitions in I,)``."""
+class ImaginaryRows(NamedTuple):
+    """
+    Transitions of challenges, each array of shape ``(n,)``.
+
+    :param slots: where they are in D
+    :param envs: their environments
+    :param rewards: their artificial rewards
+    :param is_goal: whether they lead to the goal
+    :param goal_slots: of the transitions that lead to the goals of their challenges
+    :param demonstrated: whether they, and these, are among the demonstrations instead
+    """
 
     slots: np.ndarray
     envs: np.ndarray
     rewards: np.ndarray
     is_goal: np.ndarray
+    goal_slots: np.ndarray
+    demonstrated: np.ndarray
+
+    def of(self, demonstrated: bool) -> "ImaginaryRows":
+        """:return: those of one kind"""
+        chosen = self.demonstrated == demonstrated
+        return ImaginaryRows(*(column[chosen] for column in self))
+
+
+@dataclass(frozen=True)
+class _Index:
+    """All transitions of I one after another, and when each was rewarded, shape ``(transitions in I,)``."""
+
+    rows: ImaginaryRows
     rewarded_at: np.ndarray
 
     @classmethod
@@ -191,13 +213,19 @@ class _Index:
         columns = []
         for challenge in challenges:
             steps = np.arange(challenge.start, challenge.goal + 1)
+            slots = challenge.episode.start + steps
+            if not challenge.episode.demonstrated:
+                slots %= buffer_size
             columns.append(
                 (
-                    (challenge.episode.start + steps) % buffer_size,
+                    slots,
                     np.full(len(steps), challenge.environment),
                     challenge.rewards.astype(np.float32),
                     steps == challenge.goal,
+                    np.full(len(steps), slots[-1]),
+                    np.full(len(steps), challenge.episode.demonstrated),
                     np.full(len(steps), challenge.rewarded_at),
                 )
             )
-        return cls(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+        *rows, rewarded_at = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+        return cls(ImaginaryRows(*rows), rewarded_at)

@@ -27,18 +27,20 @@ from sb3_cpm.buffers.compact import Codec
 @dataclass(frozen=True)
 class Episode:
     """
-    A complete episode in D.
+    A complete episode in D, or among the demonstrations beside it.
 
     :param env_idx: environment that it was played in
     :param start: slot of its first transition in the ring
     :param length: number of transitions
     :param ordinal: how many episodes of this environment came before it
+    :param demonstrated: it is among the demonstrations
     """
 
     env_idx: int
     start: int
     length: int
     ordinal: int
+    demonstrated: bool = False
 
     def slots(self, buffer_size: int) -> np.ndarray:
         """Slots of its transitions in a ring of ``buffer_size``, shape ``(length,)``."""

@@ -91,10 +91,11 @@ class ChallengeCurator:
         with error_prefix("reward_kwargs"):
             self.reward = ArtificialReward(coefficient_kwargs=coefficient_kwargs, **(reward_kwargs or {}))
 
-    def propose(self, rewards: np.ndarray, evaluation: Evaluation) -> Proposal | None:
+    def propose(self, rewards: np.ndarray, evaluation: Evaluation, remember: bool = True) -> Proposal | None:
         """
         :param rewards: task rewards of a complete trajectory, shape ``(n_steps,)``
         :param evaluation: the challenger's evaluation of the same trajectory
+        :param remember: let it count for reward memory and origin
         :return: the proposal, or None if the trajectory has no transition that counts (n_steps <= warmup_steps)
         :raises ValueError: for shapes that don't belong together and values that are not finite; nothing is changed then
         """
@@ -102,7 +103,8 @@ class ChallengeCurator:
         first = self.warmup_steps
         if len(rewards) == 0:
             return None
-        self.remember(rewards)
+        if remember:
+            self.remember(rewards)
         if len(rewards) <= first:
             return None
 

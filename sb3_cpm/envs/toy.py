@@ -36,6 +36,7 @@ class ToyEnv(gym.Env):
     :param keys: the observation keys wanted, a subset of ``("camera", "pointcloud", "state")``
     :param task: ``"reach"`` or ``"push"``
     :param n_points: rows of the point cloud
+    :param point_labels: points have a last column with the body that they belong to: 0 robot, 1 goal, 2 puck
     :param terminate_on_success: end the episode with success (otherwise it goes on to the time limit)
     :param render_mode: ``"rgb_array"`` for videos, or None
     :raises ValueError: for an unknown key or task
@@ -48,6 +49,7 @@ class ToyEnv(gym.Env):
         keys: Sequence[str] = KEYS,
         task: Literal["reach", "push"] = "reach",
         n_points: int = 48,
+        point_labels: bool = False,
         terminate_on_success: bool = False,
         render_mode: str | None = None,
     ) -> None:
@@ -57,13 +59,14 @@ class ToyEnv(gym.Env):
             raise ValueError(f"task={task!r}: expected 'reach' or 'push'")
         self.keys = tuple(keys)
         self.task = task
+        self.point_labels = point_labels
         self.terminate_on_success = terminate_on_success
         self.render_mode = render_mode
 
         n_bodies = 3 if task == "push" else 2
         available: dict[str, spaces.Space] = {
             "camera": spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8),
-            "pointcloud": spaces.Box(-2.0, 2.0, (n_points, 6), np.float32),
+            "pointcloud": spaces.Box(-2.0, 2.0, (n_points, 6 + point_labels), np.float32),
             "state": spaces.Box(-1.0, 1.0, (2 * n_bodies,), np.float32),
         }
         self.observation_space = spaces.Dict({key: available[key] for key in self.keys})
@@ -149,9 +152,11 @@ class ToyEnv(gym.Env):
         return observation
 
     def _points(self) -> np.ndarray:
-        cloud = np.zeros((len(self._point_offsets), 6), dtype=np.float32)
+        cloud = np.zeros((len(self._point_offsets), 6 + self.point_labels), dtype=np.float32)
         cloud[:, :2] = self._positions[self._body_of_point] + self._point_offsets
-        cloud[:, 3:] = self._colours[self._body_of_point] / np.float32(255)
+        cloud[:, 3:6] = self._colours[self._body_of_point] / np.float32(255)
+        if self.point_labels:
+            cloud[:, 6] = self._body_of_point
         return cloud
 
     def _draw(self, pixels: np.ndarray) -> np.ndarray:

@@ -112,10 +112,12 @@ DECAYS = tuple(
 )
 NO_CHALLENGES = Contender("CPM without challenges", "cpm_sac", {"replay_buffer_kwargs": {"challenge_ratio": 0.0}})
 WEAK = Contender("CPM, weak challenges", "cpm_sac", {"replay_buffer_kwargs": CHALLENGES["tuned"]})
+CONDITIONED = Contender("CPM, told its challenge", "cpm_sac", {"vec_env_wrapper": "sb3_cpm.ChallengeVecEnv"})
 #: What of the method helps or hurts where the report's constants do badly.
 PARTS = (
     SAC,
     CPM,
+    CONDITIONED,
     Contender("CPM, 200 challenges", "cpm_sac", {"replay_buffer_kwargs": {"max_challenges": 200, "mix": "row"}}),
     NO_CHALLENGES,
     WEAK,
@@ -126,6 +128,8 @@ PARTS = (
     ),
     Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
 )
+BC_PPO = Contender("BC + PPO", "bc_ppo")
+DAPG = Contender("BC + DAPG", "dapg")
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
 
@@ -153,6 +157,26 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:2], 100_000, 10_000, 20, 3, STATE, cost="12 to 38 CPU minutes per run, by processor"),
         Plan(CONTROLLERS[:1], 2000, 1000, 5, 1, STATE, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "imitation",
+        "",
+        "PickCube-v1 from state vectors: learning from 200 scripted episodes",
+        "not in the report: its prior winners cloned or used PPO; the evaluation at step 0 is the clone's",
+        (BC_PPO, DAPG),
+        "curves",
+        Plan(CONTROLLERS[:1], 40_000, 10_000, 50, 5, cost="5 CPU minutes per run"),
+        Plan((TOY,), 2000, 1000, 5, 1, SMALL, cost="1 minute on 2 cores"),
+    ),
+    Experiment(
+        "imitation-clouds",
+        "",
+        "PickCube-v1 from point clouds: a clone of 200 scripted episodes",
+        "not in the report; the evaluation at step 0 is the clone's, and hardly anything is learnt after it",
+        (BC_PPO,),
+        "curves",
+        Plan((PICKCUBE,), 2000, 2000, 50, 5, cost="8 CPU minutes per run"),
+        Plan((TOY,), 2000, 1000, 5, 1, SMALL, cost="1 minute on 2 cores"),
     ),
     Experiment(
         "pickcube-parts",

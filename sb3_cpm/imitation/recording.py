@@ -30,7 +30,12 @@ COUNTED = ("episode_returns", "episode_lengths", "episode_times", "total_steps")
 
 
 def record_demonstrations(
-    env: VecEnv, n_episodes: int, seed: int | None = None, hold: bool = False, progress_bar: bool = False
+    env: VecEnv,
+    n_episodes: int,
+    seed: int | None = None,
+    hold: bool = False,
+    progress_bar: bool = False,
+    outcomes: list[bool] | None = None,
 ) -> list[Demonstration]:
     """
     Let the expert of the environments act until it has succeeded often enough. Episodes without success are left out.
@@ -46,6 +51,7 @@ def record_demonstrations(
         step. By default a demonstration ends with its first success, also where the environment would go on (it then counts
         as cut off, not as terminated)
     :param progress_bar: show one
+    :param outcomes: gets whether each episode was a success, those that were left out among them
     :return: the demonstrations, in the same order for the same environments and seed
     :raises ValueError: if the environment has no expert, or its actions are changed on the way to it
     :raises RuntimeError: if the expert fails too often
@@ -64,6 +70,8 @@ def record_demonstrations(
             observations, rewards, dones, infos = inner.step(actions)
             show(recorder.step(observations, actions, rewards, dones, infos))
             recorder.check_failures()
+    if outcomes is not None:
+        outcomes += [True] * len(recorder.demonstrations) + [False] * recorder.n_failed
     return recorder.demonstrations
 
 
@@ -176,8 +184,9 @@ def _without_normalization(env: VecEnv) -> VecEnv:
 def _check_expert(env: VecEnv) -> None:
     if not env.has_attr(EXPERT):
         raise ValueError(
-            f"The environment has no expert, a method {EXPERT}() that gives the next action. CPMToy-v0 and these tasks of "
-            "ManiSkill have one: PickCube-v1. Give a file of demonstrations instead of 'expert'."
+            f"The environment has no expert, a method {EXPERT}() that gives the next action. CPMToy-v0, CPMReach-v0 and "
+            "these tasks of ManiSkill have one: PickCube-v1, LiftCube-v1, PushCube-v1, PullCube-v1. Give a file of "
+            "demonstrations instead of 'expert'."
         )
     if any(env.env_is_wrapped(gym.ActionWrapper)):
         raise ValueError(

@@ -177,7 +177,7 @@ def _proposal_row(episode: Episode, proposal: Proposal) -> dict[str, Any]:
     counted = slice(proposal.first, None)
     artificial = proposal.artificial
     return {
-        "env": episode.env_idx,
+        "env": -1 if episode.demonstrated else episode.env_idx,
         "episode": episode.ordinal,
         "length": episode.length,
         "goal": proposal.goal,

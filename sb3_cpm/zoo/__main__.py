@@ -7,7 +7,7 @@ rl_zoo3's commands, with our algorithms among the choices of ``--algo`` and our 
     python -m sb3_cpm.zoo train --agent sac_her --env PointMaze_UMaze-v3      gymnasium-robotics is imported
 
 All options are rl_zoo3's own but one: ``--agent NAME`` stands for ``--algo ALGO --conf-file zoo_configs/NAME.yml``. And
-``train --algo dreamer`` or ``plan2explore`` without ``--conf-file`` takes the file of that name, since rl_zoo3 has none.
+``train --algo dreamer`` (or another of our algorithms) without ``--conf-file`` takes the file of that name: rl_zoo3 has none.
 """
 
 import importlib
@@ -95,7 +95,7 @@ def complete(command: str, arguments: Sequence[str]) -> list[str]:
     :return: the same with what rl_zoo3 needs in place of what we allow, ``--option=value`` as two
     :raises ValueError: for an agent that does not exist
     """
-    from sb3_cpm.agents.algorithms import algorithm_of
+    from sb3_cpm.agents.algorithms import ALGORITHMS, algorithm_of
     from sb3_cpm.agents.configs import find_config
 
     completed = [part for argument in arguments for part in (argument.split("=", 1) if argument[:2] == "--" else [argument])]
@@ -107,7 +107,7 @@ def complete(command: str, arguments: Sequence[str]) -> list[str]:
         of_agent = ["--algo", algorithm_of(path.stem)]
         completed[at : at + 2] = [*of_agent, "--conf-file", str(path)] if command == "train" else of_agent
     algo = _option("--algo", completed)
-    if command == "train" and algo in ("dreamer", "plan2explore") and not any(map(_names_config, completed)):
+    if command == "train" and algo in ALGORITHMS and not any(map(_names_config, completed)):
         completed += ["--conf-file", str(find_config(algo))]
     return completed
 

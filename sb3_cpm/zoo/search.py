@@ -59,7 +59,7 @@ CALLBACK_SPACE = {
 }
 """What is searched for in ``ChallengerCallback``."""
 
-PLAYERS = ("sac", "td3", "tqc", "ddpg")
+PLAYERS = ("sac", "td3", "tqc", "ddpg", "rlpd")
 """Algorithms that can play against a challenger."""
 
 WORLD_MODEL_SPACE = {
@@ -82,6 +82,8 @@ def install() -> None:
     """Give our search spaces to rl_zoo3. Can be repeated."""
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
+    HYPERPARAMS_SAMPLER.setdefault("rlpd", HYPERPARAMS_SAMPLER["sac"])  # it is a SAC
+    HYPERPARAMS_CONVERTER.setdefault("rlpd", HYPERPARAMS_CONVERTER["sac"])
     for algo in PLAYERS:
         if not hasattr(HYPERPARAMS_SAMPLER[algo], "of_player"):
             HYPERPARAMS_SAMPLER[algo] = _keeping_policy(HYPERPARAMS_SAMPLER[algo])

@@ -7,6 +7,7 @@ one holds for the other.
 """
 
 import contextlib
+import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -151,7 +152,7 @@ class ManiSkillBatch:
             else:
                 last[key] = np.zeros((self.num_envs, *value.shape[1:]), dtype=value.dtype)
         self._last = last
-        return observations, self._infos(host["info"], len(rows))
+        return observations, self._infos(host["info"], rows)
 
     def step(self, actions: np.ndarray) -> BatchStep:
         """
@@ -171,7 +172,7 @@ class ManiSkillBatch:
         observations = self._observe(host, np.arange(self.num_envs), steps)
         over = host["terminated"].astype(bool) & (not self.ignore_terminations)
         truncated = steps >= self.max_episode_steps
-        infos = self._infos(host["info"], self.num_envs)
+        infos = self._infos(host["info"], np.arange(self.num_envs))
         self._remember_grasps(host, np.arange(self.num_envs))
         sane = np.isfinite(rewards) & np.isfinite(observations["state"]).all(axis=1)
         if not sane.all():
@@ -266,14 +267,16 @@ class ManiSkillBatch:
             observations[key] = place.astype(np.float32)
         return observations
 
-    def _infos(self, info: Mapping[str, np.ndarray], n: int) -> list[dict[str, Any]]:
-        """Python numbers; arrays only where a task reports more than one number."""
-        names = list(info)
+    def _infos(self, info: Mapping[str, np.ndarray], rows: np.ndarray) -> list[dict[str, Any]]:
+        """Python numbers; arrays only where a task reports more than one number. And which object it is about."""
+        names, n = list(info), len(rows)
         columns = [list(_rows(info[name], n)) for name in names]
         infos = [dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
         for one in infos:
             if "success" in one:
                 one["success"] = one["is_success"] = bool(one["success"])
+        for row, one in zip(rows.tolist(), infos, strict=True):
+            one["instance"] = self._instances[row]
         return infos
 
     # ------------------------------------------------------------------ scene
@@ -289,7 +292,8 @@ class ManiSkillBatch:
         return available if wanted is None else tuple(wanted)
 
     def _scene_changed(self) -> None:
-        """After ManiSkill built the scene: ids are new, cameras nobody wants must not be rendered."""
+        """After ManiSkill built the scene: ids and objects are new, cameras nobody wants must not be rendered."""
+        self._instances = _instances(self.env, self.env_id)
         if self.obs_mode == "visual":
             self._labels = clouds.label_table(_things(self.env))
         for name in set(self.env._sensors) - set(self.cameras):
@@ -312,6 +316,19 @@ def _things(env: Any) -> list[dict[int, tuple[str, bool]]]:
         for number, entity in zip(numbers, entities, strict=True):
             things[number][entity.per_scene_id] = (thing.name, is_robot)
     return things
+
+
+def _instances(env: Any, env_id: str) -> list[str]:
+    """
+    :param env: the ManiSkill environment
+    :param env_id: the task's name, where objects do not vary
+    :return: for each environment which object it is about: ManiSkill's name of it, without the environment's number
+    """
+    for attribute in ("_objs", "_cabinets"):
+        objects = getattr(env, attribute, ())
+        if len(objects) == env.num_envs:
+            return [re.sub(r"-\d+$", "", one.name) for one in objects]
+    return [env_id] * env.num_envs
 
 
 def _is_grasp(key: str) -> bool:
