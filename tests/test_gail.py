@@ -28,7 +28,6 @@ from sb3_cpm.imitation import (
     VectorDiscriminator,
     record_demonstrations,
 )
-from sb3_cpm.run.evaluation import evaluate
 
 N_POINTS = 40
 CLOUDS = spaces.Dict(
@@ -362,31 +361,6 @@ def test_the_agent_learns_clouds_and_grows(tmp_path: Path) -> None:
     built.model.learn(400, callback=callback)
     assert callback.discriminator.alpha == 1.0 and int(callback.discriminator.updates) == 40
     assert callback.expert.instances == ["any"]
-
-
-@pytest.mark.slow
-def test_it_learns_without_a_reward_and_not_from_noise() -> None:
-    success = {}
-    for shuffled in (False, True):
-        built = load_agent("gail_sac", "CPMReach-v0").build(seed=100, device="cpu")
-        (callback,) = built.callbacks
-        if shuffled:
-            callback.demonstrations, callback.n_episodes = (
-                _shuffled(record_demonstrations(built.env, 20, seed=1, hold=True)),
-                None,
-            )
-        built.model.learn(6000, callback=callback)
-        outcomes = evaluate(built.model, built.make_eval_env(), 50, 1_000_000)
-        success[shuffled] = np.mean([outcome.success_once for outcome in outcomes])
-    assert success[False] > 0.6 and success[True] < 0.4
-
-
-def _shuffled(demonstrations: list[Demonstration]) -> list[Demonstration]:
-    rng = np.random.default_rng(0)
-    actions = np.concatenate([one.actions for one in demonstrations])
-    rng.shuffle(actions)
-    parts = np.split(actions, len(demonstrations))
-    return [Demonstration(one.observations, part, one.rewards) for one, part in zip(demonstrations, parts, strict=True)]
 
 
 # ---------------------------------------------------------------------- bad input

@@ -17,6 +17,8 @@ from sb3_cpm.agents.tasks import ENV_IDS
 #: Tasks that are not about bringing an object to a place.
 GOALLESS = ("CPM/LiftCube-v1", "CPM/TurnFaucet-v1", "CPM/OpenCabinetDoor-v1")
 ONE_DEMONSTRATION = {"sb3_cpm.imitation.DemonstrationsCallback": {"n_episodes": 1}}
+#: Record and clone 200 episodes first; tests/test_bc_ppo.py, test_dapg.py and test_gail.py have them on smaller tasks.
+CLONES = ("bc_ppo", "dapg", "gail_sac")
 #: What makes a round short.
 SHORT: dict[str, Any] = {
     "ppo_rgbd": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
@@ -30,7 +32,7 @@ ENTRIES = [
     (path.stem, env_id)
     for env_id in ENV_IDS  # task by task: what ManiSkill has loaded once is at hand
     for path in sorted(config_folder().glob("*.yml"))
-    if env_id in read_entries(path)
+    if env_id in read_entries(path) and path.stem not in CLONES
 ]
 
 

@@ -128,6 +128,25 @@ PARTS = (
     ),
     Contender("CPM without exploration", "cpm_sac", challenger(decay="constant", decay_kwargs={"start": 0.0, "floor": 0.0})),
 )
+#: RLPD, what was left out of it or put beside it, and its control: the same player and budget without demonstrations.
+RLPD = (
+    Contender("RLPD + BC", "rlpd"),
+    Contender("RLPD + BC + challenger", "cpm_rlpd"),
+    Contender(
+        "RLPD",
+        "rlpd",
+        {"callback": [{"sb3_cpm.imitation.DemonstrationsCallback": {"demonstrations": "expert", "n_episodes": 200}}]},
+    ),
+    Contender(
+        "SAC, layer normalisation",
+        "sac_layernorm",
+        {
+            "env_kwargs": {"reward_mode": "sparse", "ignore_terminations": False},
+            "policy_kwargs": {"net_arch": [128, 128]},
+            **{"batch_size": 128, "gamma": 0.95, "tau": 0.005, "train_freq": 1, "gradient_steps": 2},
+        },
+    ),
+)
 BC_PPO = Contender("BC + PPO", "bc_ppo")
 DAPG = Contender("BC + DAPG", "dapg")
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
@@ -177,6 +196,16 @@ _ALL = (
         "curves",
         Plan((PICKCUBE,), 2000, 2000, 50, 5, cost="8 CPU minutes per run"),
         Plan((TOY,), 2000, 1000, 5, 1, SMALL, cost="1 minute on 2 cores"),
+    ),
+    Experiment(
+        "rlpd",
+        "",
+        "PickCube-v1 from state vectors, sparse reward: RLPD from 200 scripted episodes",
+        "not in the report; with and without a behaviour cloning loss, a challenger, and demonstrations",
+        RLPD,
+        "curves",
+        Plan(CONTROLLERS[:1], 10_000, 2500, 50, 5, cost="7 to 10 CPU minutes per run"),
+        Plan(CONTROLLERS[:1], 400, 200, 2, 1, cost="2 minutes on 2 cores"),
     ),
     Experiment(
         "pickcube-parts",
