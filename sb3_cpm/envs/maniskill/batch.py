@@ -20,7 +20,7 @@ from sb3_cpm.envs.maniskill import clouds
 from sb3_cpm.envs.maniskill import observations as obs_tools
 from sb3_cpm.envs.maniskill.checks import explained
 from sb3_cpm.envs.maniskill.cpu_speedups import speed_up
-from sb3_cpm.envs.maniskill.experts import Expert, make_expert
+from sb3_cpm.envs.maniskill.experts import Expert, make_expert, why_not
 from sb3_cpm.envs.maniskill.start_states import StartState, restore, state_of
 from sb3_cpm.envs.maniskill.visuals import Visuals
 from sb3_cpm.machine.thread_affinity import follow_simulation
@@ -204,11 +204,16 @@ class ManiSkillBatch:
         """
         :param i: index of the environment
         :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
-        :raises ValueError: if the task has none, or none for this controller
+        :raises ValueError: if there is none, see :attr:`no_expert`
         """
         if i not in self._experts:
             self._experts[i] = make_expert(self.env_id, self.env, i)
         return self._experts[i].act()
+
+    @property
+    def no_expert(self) -> str | None:
+        """Why the task's scripted expert cannot act here; None: it can."""
+        return why_not(self.env_id, self.env)
 
     def _remember_grasps(self, host: dict[str, Any], rows: np.ndarray) -> None:
         for part in (host["extra"], host["info"]):

@@ -101,9 +101,14 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
     def expert_action(self) -> np.ndarray:
         """
         :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
-        :raises ValueError: if the task has none, or none for this controller
+        :raises ValueError: if there is none, see :attr:`no_expert`
         """
         return self.batch.expert_action(0)
+
+    @property
+    def no_expert(self) -> str | None:
+        """Why the task's scripted expert cannot act here; None: it can."""
+        return self.batch.no_expert
 
     # ------------------------------------------------------------------ start states
     def get_state(self) -> StartState:

@@ -18,6 +18,7 @@ TURN = -0.1
 OPEN, CLOSED = 1.0, -1.0
 #: Controllers whose actions the experts give: translation, rotation where there is one, fingers.
 CONTROLLERS = ("pd_ee_delta_pose", "pd_ee_delta_pos")
+ROBOTS = ("panda", "panda_wristcam")
 UP = np.array([0.0, 0.0, 1.0])
 LEVEL = np.array([1.0, 1.0, 0.0])
 """Times a vector: its part along the table."""
@@ -36,7 +37,7 @@ class Expert:
         self.task = task
         self.row = row
         #: Whether the controller turns the hand.
-        self.turns = task.control_mode == "pd_ee_delta_pose"
+        self.turns = task.single_action_space.shape[0] == 7
 
     def act(self) -> np.ndarray:
         """:return: the next action, in [-1, 1], shape ``(7,)`` or ``(4,)``"""
@@ -330,19 +331,33 @@ EXPERTS: dict[str, type[Expert]] = {
 """By ManiSkill's names of the tasks."""
 
 
+def why_not(env_id: str, task: Any) -> str | None:
+    """
+    :param env_id: ManiSkill's name of the task
+    :param task: the ManiSkill environment
+    :return: why no expert acts there, and the cure; None: one does
+    """
+    if env_id not in EXPERTS:
+        return f"{env_id} has no scripted expert; these tasks have one: {', '.join(EXPERTS)}."
+    if task.agent.uid not in ROBOTS:
+        return f"The scripted experts move {' and '.join(ROBOTS)}, not {task.agent.uid}: leave robot_uids away."
+    controllers = EXPERTS[env_id].controllers
+    if task.control_mode not in controllers:
+        return (
+            f"The scripted expert of {env_id} gives actions of {' and '.join(controllers)}, this environment has "
+            f"{task.control_mode}. Make it with control_mode={controllers[0]!r}."
+        )
+    return None
+
+
 def make_expert(env_id: str, task: Any, row: int) -> Expert:
     """
     :param env_id: ManiSkill's name of the task
     :param task: the ManiSkill environment
     :param row: which of its parallel scenes
-    :raises ValueError: if nobody has written one for it, or for its controller
+    :raises ValueError: if there is none, see :func:`why_not`
     """
-    if env_id not in EXPERTS:
-        raise ValueError(f"{env_id} has no scripted expert; these tasks have one: {', '.join(EXPERTS)}.")
-    expert = EXPERTS[env_id]
-    if task.control_mode not in expert.controllers:
-        raise ValueError(
-            f"The scripted expert of {env_id} gives actions of {' and '.join(expert.controllers)}, this environment has "
-            f"{task.control_mode}. Make it with control_mode={expert.controllers[0]!r}."
-        )
-    return expert(task, row)
+    reason = why_not(env_id, task)
+    if reason is not None:
+        raise ValueError(reason)
+    return EXPERTS[env_id](task, row)
