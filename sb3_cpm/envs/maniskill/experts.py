@@ -254,7 +254,7 @@ class LiftPegUpright(Grasp):
 
     controllers = ("pd_ee_delta_pose",)
     #: The fingers turn the peg as they close: the hand need not have turned all the way. Then it goes down from close by
-    TURNED, CLEARANCE = 0.6, 0.035
+    TURNED, CLEARANCE = 0.7, 0.035
     #: Metres from the peg's middle to the grasp, along the peg and upwards
     BEYOND, HIGHER = 0.09, 0.01
     #: Of the gripper's action: 3 N on the peg, which hold it, and let it turn
