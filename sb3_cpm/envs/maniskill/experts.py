@@ -31,7 +31,7 @@ class Expert:
     """
 
     #: The controllers with which it can do the task.
-    controllers = CONTROLLERS
+    controllers: tuple[str, ...] = CONTROLLERS
 
     def __init__(self, task: Any, row: int):
         self.task = task
