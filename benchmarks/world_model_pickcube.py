@@ -44,7 +44,6 @@ import matplotlib.pyplot as plt
 
 if TYPE_CHECKING:
     from sb3_cpm.envs import ManiSkillEnv
-    from sb3_cpm.envs.maniskill.scripted import PickCubeController
 
 CAMERAS = ("base_camera", "hand_camera")
 KEYS = (*CAMERAS, "state")
@@ -81,12 +80,12 @@ class Recorded(NamedTuple):
 
 
 # ---------------------------------------------------------------------- episodes
-def record(env: "ManiSkillEnv", controller: "PickCubeController", seed: int, rng: np.random.Generator) -> Recorded:
+def record(env: "ManiSkillEnv", seed: int, rng: np.random.Generator) -> Recorded:
     """One episode of the kind that its seed says, in turns."""
     kind = KINDS[seed % len(KINDS)]
     seen, actions, rewards = [env.reset(seed=seed)[0]], [], []
     for _ in range(STEPS):
-        action = np.asarray(env.action_space.sample() if kind == "random" else controller.act())
+        action = env.action_space.sample() if kind == "random" else env.expert_action()
         if kind == "noisy":
             action = np.clip(action + rng.normal(scale=0.3, size=action.shape), -1, 1).astype(np.float32)
         observation, reward, *_ = env.step(action)
@@ -100,13 +99,12 @@ def record(env: "ManiSkillEnv", controller: "PickCubeController", seed: int, rng
 def record_all(n_training: int, n_held_out: int) -> list[Recorded]:
     """Episodes to learn from, then held-out ones."""
     from sb3_cpm.envs import make_maniskill_env
-    from sb3_cpm.envs.maniskill.scripted import PickCubeController
 
     env = make_maniskill_env("PickCube-v1", n_points=0, goal_points=0, ignore_terminations=True)
     env.action_space.seed(0)
     rng = np.random.default_rng(0)
     seeds = [*range(n_training), *range(1_000_000, 1_000_000 + n_held_out)]
-    recorded = [record(env, PickCubeController(env), seed, rng) for seed in seeds]
+    recorded = [record(env, seed, rng) for seed in seeds]
     env.close()
     return recorded
 

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.distance import cdist
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cpm.envs import GoalView, ManiSkillEnv, make_maniskill_env
 from sb3_cpm.envs.maniskill import assets
 from sb3_cpm.envs.maniskill.tasks import REPORT_TASKS, register_report_tasks
+from sb3_cpm.imitation import record_demonstrations
 
 CONTROLLERS = ("pd_ee_delta_pose", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 STEPS = {"TurnFaucet-v1": 200, "OpenCabinetDrawer-v1": 100, "OpenCabinetDoor-v1": 100}
@@ -68,6 +70,46 @@ def test_visual(env_id: str, control_mode: str) -> None:
 def test_a_controller_that_the_robot_lacks_is_named_with_those_it_has(env_id: str) -> None:
     with pytest.raises(ValueError, match=r"has no controller 'pd_ee_pos_delta'.*pd_ee_delta_pose.*pd_ee_target_delta_pose"):
         make(env_id, control_mode="pd_ee_pos_delta")
+
+
+# ---------------------------------------------------------------------- which object it is about, and demonstrations with it
+@pytest.mark.parametrize("env_id", ["PickSingleYCB-v1", "PickSingleEGAD-v1", "TurnFaucet-v1", "OpenCabinetDrawer-v1"])
+def test_infos_name_the_object(env_id: str) -> None:
+    env = make(env_id, obs_mode="state")
+    seen = set()
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        assert info["instance"] in env.unwrapped.all_model_ids  # type: ignore[attr-defined]
+        assert next(play(env, 1))[-1]["instance"] == info["instance"]
+        seen.add(info["instance"])
+    assert len(seen) > 1, "each reset may bring another one"
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["TurnFaucet-v1", "OpenCabinetDrawer-v1", "PickSingleYCB-v1"])
+def test_points_by_role(env_id: str) -> None:
+    by_role, in_order = (
+        make(env_id, point_labels=labels, n_points=1000, image_size=64, goal_points=0) for labels in ("roles", True)
+    )
+    roles, places = (env.reset(seed=3)[0]["pointcloud"][:, 6] for env in (by_role, in_order))
+    task: Any = by_role.unwrapped
+    things = [thing.name for thing in task.scene.actors.values() if thing.name not in ("ground", "table-workspace")]
+    for articulation in task.scene.articulations.values():
+        things += [link.name for link in articulation.links if articulation is not task.agent.robot]
+    target = getattr(task, {"TurnFaucet-v1": "target_switch_link", "OpenCabinetDrawer-v1": "handle_link"}.get(env_id, "obj"))
+    name = getattr(target._objs[0], "entity", target._objs[0]).name  # after that of its scene
+    found = {role: {things[int(place) - 1] for place in places[roles == role]} for role in set(roles) - {0}}
+    assert len(found[1.0]) == 1 and name.endswith(found[1.0].pop()), (name, found)
+    assert (2.0 in found) == (env_id != "PickSingleYCB-v1") and set(roles[places == 0]) == {0}
+    by_role.close(), in_order.close()
+
+
+@pytest.mark.parametrize("env_id", ["PickSingleYCB-v1", "PickSingleEGAD-v1"])
+def test_experts_pick_objects(env_id: str) -> None:
+    env = make_vec_env(make, 1, env_kwargs={"env_id": env_id, "obs_mode": "state"})
+    found = record_demonstrations(env, 5, seed=0, outcomes=(outcomes := []))
+    assert len(outcomes) <= 6 and len({one.instance for one in found}) > 1
+    env.close()
 
 
 # ---------------------------------------------------------------------- start states

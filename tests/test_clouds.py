@@ -102,13 +102,23 @@ def test_frames_of_reference() -> None:
 
 
 def test_labels_count_the_things_in_the_order_of_the_scene() -> None:
-    things = {3: ("ground", False), 7: ("link", True), 5: ("cube", False), 4: ("ball", False)}
+    things = {
+        3: clouds.Thing("ground", False),
+        7: clouds.Thing("link", True),
+        5: clouds.Thing("cube", False, clouds.REST),
+        4: clouds.Thing("ball", False, clouds.TARGET),
+        2: clouds.Thing("cone", False),
+    }
     table = clouds.label_table([things, {}])
     assert table.shape == (2, 9)
-    assert {i: int(table[0, i]) for i in (0, 3, 7, 5, 4)} == {0: -1, 3: -1, 7: 0, 5: 1, 4: 2}
+    assert {i: int(table[0, i]) for i in (0, 3, 7, 5, 4, 2, 8)} == {0: -1, 3: -1, 7: 0, 5: 1, 4: 2, 2: 3, 8: 1}
+    table = clouds.label_table([things, {}], by_role=True)
+    assert {i: int(table[0, i]) for i in (0, 3, 7, 5, 4, 2, 8)} == {0: -1, 3: -1, 7: 0, 5: 2, 4: 1, 2: 3, 8: 3}
 
 
 def test_settings_are_checked() -> None:
+    with pytest.raises(ValueError, match="point_labels must be one of False, True, roles, got 'role'"):
+        clouds.CloudSettings(labels="role").check()
     with pytest.raises(ValueError, match="random, farthest, got 'fps'"):
         clouds.CloudSettings(sampling="fps").check()
     with pytest.raises(ValueError, match="world, base, end_effector"):

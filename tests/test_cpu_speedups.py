@@ -10,8 +10,7 @@ import pytest
 pytest.importorskip("mani_skill")
 
 from sb3_cpm.envs import make_maniskill_env
-from sb3_cpm.envs.maniskill import batch, cpu_speedups, meshes
-from sb3_cpm.envs.maniskill.scripted import PickCubeController
+from sb3_cpm.envs.maniskill import batch, cpu_speedups, experts, meshes
 
 pytestmark = pytest.mark.maniskill
 
@@ -26,14 +25,14 @@ def env_of(make: Callable[[], Any]) -> Iterator[Any]:
 
 
 def episodes(env: Any, n_steps: int = 18) -> list[Any]:
-    """One episode that grasps (where the controller is the scripted one's) and one at random; everything that can be seen."""
+    """One episode that grasps (where the controller is the expert's) and one at random; everything that can be seen."""
     seen = []
     for seed, scripted in ((3, env.action_space.shape == (7,)), (4, False)):
         rng = np.random.default_rng(seed)
         env.reset(seed=seed)
-        controller = PickCubeController(env) if scripted else None
+        expert = experts.PickCube(env.unwrapped, 0) if scripted else None
         for _ in range(n_steps):
-            action = controller.act() if controller else rng.uniform(-1, 1, env.action_space.shape)
+            action = expert.act() if expert else rng.uniform(-1, 1, env.action_space.shape)
             observation, reward, terminated, _, info = env.step(action)
             state = env.get_state()["simulation"]
             seen.append((observation, reward, terminated, info, state))

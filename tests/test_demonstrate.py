@@ -10,7 +10,8 @@ from sb3_cpm import CPMBuffer
 from sb3_cpm.__main__ import main
 from sb3_cpm.agents import load_agent
 from sb3_cpm.buffers.demonstrations import read_demonstrations
-from sb3_cpm.imitation import record_demonstrations
+from sb3_cpm.envs import make_maniskill_vec_env
+from sb3_cpm.imitation import load_demonstrations, record_demonstrations
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -35,9 +36,15 @@ def test_the_file_holds_what_training_sees(n_envs: int, tmp_path: Path, capsys: 
 @pytest.mark.maniskill
 def test_the_robot_with_the_object_that_it_is_about(tmp_path: Path) -> None:
     file = tmp_path / "push.h5"
-    assert main(["demonstrate", "--env", "PushCube-v1", "--episodes", "2", "--agent", "bc_ppo", "--output", str(file)]) == 0
+    command = ["demonstrate", "--env", "PushCube-v1", "--episodes", "2", "--env-kwargs", "obs_mode=state"]
+    assert main([*command, "--output", str(file)]) == 0
     entries = json.loads(file.with_suffix(".json").read_text())["episodes"]
-    assert [entry["instance"] for entry in entries] == ["PushCube-v1"] * 2
+    assert [(entry["instance"], entry["control_mode"]) for entry in entries] == [("PushCube-v1", "pd_ee_delta_pose")] * 2
+    env = make_maniskill_vec_env("PushCube-v1", obs_mode="state", control_mode="pd_ee_target_delta_pose")  # as many numbers
+    told = r"controller pd_ee_delta_pose\).*controller pd_ee_target_delta_pose\).*pd_joint_pos.*Record them anew"
+    with pytest.raises(ValueError, match=told):
+        load_demonstrations(file, env)
+    env.close()
 
 
 @pytest.mark.parametrize(

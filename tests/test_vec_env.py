@@ -460,6 +460,20 @@ def test_stock_worker_processes() -> None:
 
 
 @pytest.mark.maniskill
+def test_points_by_role() -> None:
+    env = make_maniskill_env("StackCube-v1", n_points=400, point_labels="roles", image_size=64)
+    seen = env.reset(seed=1)[0]["pointcloud"]
+    task: Any = env.unwrapped
+    assert set(seen[:, 6]) == {0.0, 1.0, 3.0}
+    for role, cube in ((1, task.cubeA), (3, task.cubeB)):
+        distances = np.linalg.norm(seen[seen[:, 6] == role, :3] - cube.pose.p[0].numpy(), axis=1)
+        assert (distances < 0.02 * 3**0.5 + 0.002).all(), "the cube to be moved is 1, the other one 3"
+    env.close()
+    with pytest.raises(ValueError, match="RollBall-v1 does not say what is to be acted on.*point_labels=True"):
+        make_maniskill_env("RollBall-v1", point_labels="roles")
+
+
+@pytest.mark.maniskill
 @pytest.mark.parametrize("frame", ["base", "end_effector"])
 def test_clouds_in_other_frames_with_labels(frame: str) -> None:
     kwargs: dict[str, Any] = {"n_points": 64, "goal_points": 4, "point_labels": True, "point_sampling": "farthest"}

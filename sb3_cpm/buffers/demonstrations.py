@@ -27,6 +27,8 @@ from sb3_cpm.files import write_bytes, write_text
 
 logger = logging.getLogger(__name__)
 
+#: Controllers whose demonstrations ManiSkill's ``replay_trajectory`` converts.
+CONVERTED = ("pd_joint_pos", "pd_joint_delta_pos")
 #: Share of a demonstration's actions that may be clipped; of more than that another unit is the likelier reason.
 MOST_CLIPPED = 0.5
 
@@ -52,13 +54,18 @@ class Demonstration:
 
 
 def read_demonstrations(
-    path: str | Path, observation_space: spaces.Dict, action_space: spaces.Space, env: Any = None
+    path: str | Path,
+    observation_space: spaces.Dict,
+    action_space: spaces.Space,
+    env: Any = None,
+    control_mode: str | None = None,
 ) -> list[Demonstration]:
     """
     :param path: the ``.h5`` file; the ``.json`` of the same name is read too
     :param observation_space: what the observations must be
     :param action_space: what the actions must be
     :param env: environment to replay the actions in; None: take the observations that the file holds, if they are such
+    :param control_mode: the environment's; None: that of ``env``
     :return: its episodes
     :raises ValueError: if that cannot be done, and how it could
     """
@@ -70,6 +77,7 @@ def read_demonstrations(
             "Actions are replayed in a single environment: `env` is a VecEnv. Pass one as gymnasium.make() or "
             "make_maniskill_env() gives it."
         )
+    control_mode = control_mode or getattr(getattr(env, "unwrapped", None), "control_mode", None)
     index = _read_index(path.with_suffix(".json"))
     if not path.is_file():
         raise ValueError(f"There is no file {path}: `source` is the path of ManiSkill's .h5, or a list of Demonstrations.")
@@ -84,7 +92,7 @@ def read_demonstrations(
             if name not in file:
                 raise ValueError(f"{path} has no {name}, which the .json file lists; the files don't belong together")
             recorded = file[name]
-            _check_actions(recorded["actions"].shape[1:], action_space, record, path)
+            _check_actions(recorded["actions"].shape[1:], action_space, record, path, control_mode)
             observations = _recorded_observations(recorded, observation_space) if env is None else None
             if observations is not None and "rewards" in recorded:
                 episodes.append(
@@ -114,7 +122,11 @@ def read_demonstrations(
 
 
 def write_demonstrations(
-    path: str | Path, episodes: Sequence[Demonstration], env_id: str, env_kwargs: Mapping[str, Any]
+    path: str | Path,
+    episodes: Sequence[Demonstration],
+    env_id: str,
+    env_kwargs: Mapping[str, Any],
+    control_mode: str | None = None,
 ) -> None:
     """
     As ManiSkill's files are, with observations, rewards and the instance: :func:`read_demonstrations` needs no environment.
@@ -123,6 +135,7 @@ def write_demonstrations(
     :param episodes: to write
     :param env_id: ManiSkill's or gymnasium's name of the task
     :param env_kwargs: what it was made with, plain data
+    :param control_mode: of its robot, if it has one
     :raises NotWrittenError: if the disk does not take it; nothing is there then
     """
     path = Path(path)
@@ -139,7 +152,8 @@ def write_demonstrations(
             group["terminated"], group["truncated"] = ends & episode.terminated, ends & (not episode.terminated)
             for key, array in episode.observations.items():
                 group.create_dataset(f"obs/{key}", data=array, compression="gzip" if array.ndim > 2 else None)
-            index["episodes"].append({"episode_id": number, "success": True, "instance": episode.instance})
+            record = {"episode_id": number, "success": True, "instance": episode.instance}
+            index["episodes"].append(record if control_mode is None else {**record, "control_mode": control_mode})
     write_bytes(path, content.getvalue())
     write_text(path.with_suffix(".json"), json.dumps(index, indent=1) + "\n")
 
@@ -157,13 +171,27 @@ def _read_index(path: Path) -> dict[str, Any]:
     return index
 
 
-def _check_actions(shape: tuple[int, ...], space: spaces.Space, record: dict[str, Any], path: Path) -> None:
-    if shape != space.shape:
-        raise ValueError(
-            f"{path} holds actions of shape {shape} (controller {record.get('control_mode', 'unknown')}), the environment "
-            f"takes {space.shape}. Convert them: python -m mani_skill.trajectory.replay_trajectory --traj-path {path.name} -c "
-            "<the environment's control mode> -o none --save-traj"
+def _check_actions(
+    shape: tuple[int, ...], space: spaces.Space, record: dict[str, Any], path: Path, control_mode: str | None
+) -> None:
+    recorded = record.get("control_mode")
+    other = recorded is not None and control_mode is not None and recorded != control_mode
+    if shape == space.shape and not other:
+        return
+    wanted = control_mode or "<the environment's control mode>"
+    if recorded is None or recorded in CONVERTED:
+        command = f"python -m mani_skill.trajectory.replay_trajectory --traj-path {path.name}"
+        cure = f"Convert them: {command} -c {wanted} -o none --save-traj"
+    else:
+        cure = (
+            f"ManiSkill's replay_trajectory converts those of {' and '.join(CONVERTED)} only. Record them anew (python -m "
+            f"sb3_cpm demonstrate ... --env-kwargs control_mode={wanted}), or make the environment with "
+            f"control_mode={recorded!r}."
         )
+    raise ValueError(
+        f"{path} holds actions of shape {shape} (controller {recorded or 'unknown'}), the environment takes {space.shape} "
+        f"(controller {control_mode or 'unknown'}). {cure}"
+    )
 
 
 def _recorded_observations(recorded: Any, space: spaces.Dict) -> dict[str, np.ndarray] | None:
@@ -175,7 +203,7 @@ def _recorded_observations(recorded: Any, space: spaces.Dict) -> dict[str, np.nd
         if len(space.spaces) != 1:
             return None
         obs = {next(iter(space.spaces)): obs}
-    if not set(space.spaces) <= set(obs.keys()):
+    if any(key not in obs for key in space.spaces):  # "a/b" is b within a
         return None
     found = {key: obs[key] for key in space.spaces}
     if any(not hasattr(array, "shape") or not _fits(array.shape[1:], space.spaces[key]) for key, array in found.items()):

@@ -4,6 +4,7 @@ Learning from demonstrations: recorded episodes of somebody who can do the task,
 ==================  ============================================================================
 ``recording``       episodes of the scripted expert that an environment has, as training sees them
 ``loading``         demonstrations from wherever they are: an expert, files, a list
+``datasets``        those of Minari and LeRobot
 ``callback``        :class:`DemonstrationsCallback` fills the replay buffer when training starts
 ``cloning``         :func:`clone`: an actor learns demonstrated actions; as a callback, before PPO
 ``dapg``            :class:`DAPG`: PPO beside demonstrations

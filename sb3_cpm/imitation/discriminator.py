@@ -248,7 +248,7 @@ def _cloud_of(space: spaces.Dict, keys: Sequence[str] | None) -> str:
     if n_columns not in (4, 7):  # xyz and label, with or without colours
         raise ValueError(
             f"The points of {clouds[0]!r} have {n_columns} numbers, without the label of their part: xyz and label, or xyz, "
-            "rgb and label are expected. Make the environment with env_kwargs=dict(point_labels=True)."
+            "rgb and label are expected. Make the environment with env_kwargs=dict(point_labels=True) (ManiSkill: 'roles')."
         )
     return clouds[0]
 

@@ -19,12 +19,13 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, 
 from sb3_cpm.arguments import check, integer
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.dreamer.spaces import as_dict
+from sb3_cpm.envs.maniskill.experts import EXPERTS
 from sb3_cpm.exploration import without_exploration
 from sb3_cpm.imitation.progress import progress
 from sb3_cpm.training_env import success_of
 
-#: The expert's method.
-EXPERT = "expert_action"
+#: The expert's method; and where an environment says why it has none after all, before that is called in a worker process.
+EXPERT, NO_EXPERT = "expert_action", "no_expert"
 #: An expert may fail this often for each episode that is wanted, and :data:`FREE_FAILURES` times more.
 FAILURES_PER_EPISODE, FREE_FAILURES = 4, 10
 #: What a Monitor has counted.
@@ -188,9 +189,11 @@ def _check_expert(env: VecEnv) -> None:
     if not env.has_attr(EXPERT):
         raise ValueError(
             f"The environment has no expert, a method {EXPERT}() that gives the next action. CPMToy-v0, CPMReach-v0 and "
-            "these tasks of ManiSkill have one: PickCube-v1, LiftCube-v1, PushCube-v1, PullCube-v1. Give a file of "
-            "demonstrations instead of 'expert'."
+            f"these tasks of ManiSkill have one: {', '.join(EXPERTS)}. Give a file of demonstrations instead of 'expert'."
         )
+    for reason in env.get_attr(NO_EXPERT) if env.has_attr(NO_EXPERT) else ():
+        if reason:
+            raise ValueError(f"{reason} Or give a file of demonstrations instead of 'expert'.")
     if any(env.env_is_wrapped(gym.ActionWrapper)):
         raise ValueError(
             "A wrapper changes the actions on their way to the environment, whose expert gives what arrives there. Make the "

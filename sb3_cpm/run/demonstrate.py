@@ -56,10 +56,11 @@ def demonstrate(
     outcomes: list[bool] = []
     try:
         found = record_demonstrations(built.env, episodes, seed, hold, progress_bar, outcomes)
+        control_mode = built.env.get_attr("control_mode")[0] if built.env.has_attr("control_mode") else None
     finally:
         built.env.close()
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_demonstrations(path, found, env_id, loaded.hyperparameters.get("env_kwargs") or {})
+    write_demonstrations(path, found, env_id, loaded.hyperparameters.get("env_kwargs") or {}, control_mode)
     steps = sum(len(one.rewards) for one in found)
     tell(
         f"{len(found)} demonstrations of {env_id}, {steps} transitions, in {path}. The expert succeeded in {sum(outcomes)} of "

@@ -13,7 +13,7 @@ made.
 ``visuals``       robots of few triangles for software renderers; ``meshes``: how they are made
 ``cpu_speedups``  the same numbers for less work
 ``tasks``         tasks of the report that ManiSkill lacks; ``assets``: their files
-``scripted``      a controller that solves PickCube, for demonstrations
+``experts``       controllers that solve tasks, for demonstrations
 ================  ==============================================================================
 """
 

@@ -20,13 +20,17 @@ from sb3_cpm.envs.maniskill import clouds
 from sb3_cpm.envs.maniskill import observations as obs_tools
 from sb3_cpm.envs.maniskill.checks import explained
 from sb3_cpm.envs.maniskill.cpu_speedups import speed_up
-from sb3_cpm.envs.maniskill.experts import Expert, make_expert
+from sb3_cpm.envs.maniskill.experts import Expert, make_expert, why_not
 from sb3_cpm.envs.maniskill.start_states import StartState, restore, state_of
 from sb3_cpm.envs.maniskill.visuals import Visuals
 from sb3_cpm.machine.thread_affinity import follow_simulation
 
 OBS_MODES = {"visual": "rgb+position+segmentation", "state": "state_dict"}
 """Our observation modes and ManiSkill's. "rgb+position+segmentation" costs the same one render as "rgb" alone."""
+
+
+TARGETS = ("handle_link", "target_switch_link", "obj", "cube", "cubeA", "peg", "charger")
+"""Where tasks keep what is to be acted on: the moving link of cabinets and faucets, or an object."""
 
 
 class BatchStep(NamedTuple):
@@ -204,11 +208,16 @@ class ManiSkillBatch:
         """
         :param i: index of the environment
         :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
-        :raises ValueError: if the task has none, or none for this controller
+        :raises ValueError: if there is none, see :attr:`no_expert`
         """
         if i not in self._experts:
             self._experts[i] = make_expert(self.env_id, self.env, i)
         return self._experts[i].act()
+
+    @property
+    def no_expert(self) -> str | None:
+        """Why the task's scripted expert cannot act here; None: it can."""
+        return why_not(self.env_id, self.env)
 
     def _remember_grasps(self, host: dict[str, Any], rows: np.ndarray) -> None:
         for part in (host["extra"], host["info"]):
@@ -291,31 +300,50 @@ class ManiSkillBatch:
             raise ValueError(f"point_frame='end_effector': robot {self.env.agent.uid!r} names no end effector; take 'base'.")
         return available if wanted is None else tuple(wanted)
 
+    def _target(self) -> Any:
+        if self.cloud.labels != "roles":
+            return None
+        for name in TARGETS:
+            if hasattr(self.env, name):
+                return getattr(self.env, name)
+        raise ValueError(f"point_labels='roles': {self.env_id} does not say what is to be acted on. Take point_labels=True.")
+
     def _scene_changed(self) -> None:
         """After ManiSkill built the scene: ids and objects are new, cameras nobody wants must not be rendered."""
         self._instances = _instances(self.env, self.env_id)
         if self.obs_mode == "visual":
-            self._labels = clouds.label_table(_things(self.env))
+            things = _things(self.env, self._target())
+            self._labels = clouds.label_table(things, by_role=self.cloud.labels == "roles")
         for name in set(self.env._sensors) - set(self.cameras):
             del self.env._sensors[name]
         speed_up(self.env)
 
 
-def _things(env: Any) -> list[dict[int, tuple[str, bool]]]:
-    """For each environment: segmentation id to the name of the thing and whether it is part of a robot."""
-    things: list[dict[int, tuple[str, bool]]] = [{} for _ in range(env.num_envs)]
+def _things(env: Any, target: Any) -> list[dict[int, clouds.Thing]]:
+    """
+    :param env: the ManiSkill environment
+    :param target: the actor or link that is to be acted on; None if nobody wants to know
+    :return: for each environment: segmentation id to the thing
+    """
+    things: list[dict[int, clouds.Thing]] = [{} for _ in range(env.num_envs)]
     agents = getattr(env.agent, "agents", [env.agent])
     robots = {id(agent.robot) for agent in agents if agent is not None}
-    scene = env.scene
-    named = [(actor, actor._objs, False) for actor in scene.actors.values()]
-    for articulation in scene.articulations.values():
-        is_robot = id(articulation) in robots
-        named += [(link, [part.entity for part in link._objs], is_robot) for link in articulation.links]
-    for thing, entities, is_robot in named:
-        numbers = thing._scene_idxs.tolist()  # a thing may be in some of the environments only
-        for number, entity in zip(numbers, entities, strict=True):
-            things[number][entity.per_scene_id] = (thing.name, is_robot)
+    targets = set() if target is None else set(_ids(target))
+    named = [(actor, False, clouds.OTHER) for actor in env.scene.actors.values()]
+    for articulation in env.scene.articulations.values():
+        acted_on = any(not targets.isdisjoint(_ids(link)) for link in articulation.links)
+        role = clouds.REST if acted_on else clouds.OTHER
+        named += [(link, id(articulation) in robots, role) for link in articulation.links]
+    for thing, is_robot, role in named:
+        for number, i in _ids(thing):
+            things[number][i] = clouds.Thing(thing.name, is_robot, clouds.TARGET if (number, i) in targets else role)
     return things
+
+
+def _ids(thing: Any) -> list[tuple[int, int]]:
+    """Of an actor or link, which may be in some of the environments only: environment and segmentation id there."""
+    entities = [getattr(part, "entity", part) for part in thing._objs]  # links are components of theirs
+    return [(number, one.per_scene_id) for number, one in zip(thing._scene_idxs.tolist(), entities, strict=True)]
 
 
 def _instances(env: Any, env_id: str) -> list[str]:
@@ -324,7 +352,7 @@ def _instances(env: Any, env_id: str) -> list[str]:
     :param env_id: the task's name, where objects do not vary
     :return: for each environment which object it is about: ManiSkill's name of it, without the environment's number
     """
-    for attribute in ("_objs", "_cabinets"):
+    for attribute in ("_objs", "_faucets", "_cabinets"):
         objects = getattr(env, attribute, ())
         if len(objects) == env.num_envs:
             return [re.sub(r"-\d+$", "", one.name) for one in objects]

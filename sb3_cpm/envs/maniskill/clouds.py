@@ -21,6 +21,11 @@ BACKGROUND_NAMES = ("ground", "table-workspace")
 BACKGROUND, ROBOT, GOAL = -1, 0, -1
 """Labels: background points are dropped, the robot is 0, objects count from 1; so -1 is free for the points at the goal."""
 
+TARGET, REST, OTHER = 1, 2, 3
+"""Labels by role: the thing to act on, the rest of what it is a part of, everything else."""
+
+LABELS = (False, True, "roles")
+
 GOAL_COLOR = (0.0, 1.0, 0.0)
 """ManiSkill's own colour for goal markers, which it hides from every observation; so no rendered point has it by chance."""
 
@@ -40,7 +45,7 @@ class CloudSettings(NamedTuple):
     :param max_distance: metres from the camera beyond which points are dropped
     :param sampling: one of :data:`SAMPLINGS`
     :param frame: one of :data:`FRAMES`
-    :param labels: whether the last column says what a point belongs to
+    :param labels: whether the last column says what a point belongs to; ``"roles"``: by what that is for
     """
 
     n_points: int = 256
@@ -48,16 +53,20 @@ class CloudSettings(NamedTuple):
     max_distance: float = 3.0
     sampling: str = "random"
     frame: str = "world"
-    labels: bool = False
+    labels: bool | str = False
 
     def check(self) -> "CloudSettings":
         """
         :return: these settings
         :raises ValueError: if a name is unknown
         """
-        for name, value, known in (("point_sampling", self.sampling, SAMPLINGS), ("point_frame", self.frame, FRAMES)):
+        for name, value, known in (
+            ("point_sampling", self.sampling, SAMPLINGS),
+            ("point_frame", self.frame, FRAMES),
+            ("point_labels", self.labels, LABELS),
+        ):
             if value not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}.")
+                raise ValueError(f"{name} must be one of {', '.join(map(str, known))}, got {value!r}.")
         return self
 
 
@@ -237,23 +246,40 @@ def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def label_table(names: Sequence[dict[int, tuple[str, bool]]]) -> np.ndarray:
+class Thing(NamedTuple):
+    """
+    Something that a camera sees.
+
+    :param name: ManiSkill's
+    :param is_robot: whether it is part of a robot
+    :param role: of what is not: :data:`TARGET`, :data:`REST` or :data:`OTHER`
+    """
+
+    name: str
+    is_robot: bool
+    role: int = OTHER
+
+
+def label_table(scenes: Sequence[dict[int, Thing]], by_role: bool = False) -> np.ndarray:
     """
     What segmentation ids stand for: the robot is 0, the other things count from 1 in the order in which the scene lists them.
 
-    :param names: for each environment: id to the name of the thing and whether it is part of a robot
+    :param scenes: for each environment: id to the thing
+    :param by_role: other things are labelled by their roles instead
     :return: shape ``(N, n_ids)``; id 0, where a ray hits nothing, is background. The last column is for unknown ids: things
     """
-    n_ids = 2 + max((i for things in names for i in things), default=0)
-    table = np.ones((len(names), n_ids), dtype=np.int16)
+    n_ids = 2 + max((i for things in scenes for i in things), default=0)
+    table = np.full((len(scenes), n_ids), OTHER if by_role else 1, dtype=np.int16)
     table[:, 0] = BACKGROUND
-    for row, things in zip(table, names, strict=True):
+    for row, things in zip(table, scenes, strict=True):
         label = ROBOT
-        for i, (name, is_robot) in things.items():
-            if name in BACKGROUND_NAMES:
+        for i, thing in things.items():
+            if thing.name in BACKGROUND_NAMES:
                 row[i] = BACKGROUND
-            elif is_robot:
+            elif thing.is_robot:
                 row[i] = ROBOT
+            elif by_role:
+                row[i] = thing.role
             else:
                 label += 1
                 row[i] = label
@@ -282,7 +308,7 @@ def make_clouds(
     :return: shape ``(N, n_points + goal_points, 6 or 7)``, float32
     """
     points, owner = scene_points(pictures, labels, settings.max_distance)
-    features = POINT_FEATURES + int(settings.labels)
+    features = POINT_FEATURES + int(bool(settings.labels))
     clouds: Any = resize_clouds(points[:, :features], owner, settings.n_points, settings.sampling, hand, rng)
     if goal is not None and settings.goal_points:
         clouds = np.concatenate([clouds, goal_clouds(goal, settings.goal_points)[:, :, :features]], axis=1)

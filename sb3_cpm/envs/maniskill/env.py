@@ -101,9 +101,14 @@ class ManiSkillEnv(gym.Wrapper[Any, Any, Any, Any]):
     def expert_action(self) -> np.ndarray:
         """
         :return: what the task's scripted expert does now, see :mod:`sb3_cpm.envs.maniskill.experts`
-        :raises ValueError: if the task has none, or none for this controller
+        :raises ValueError: if there is none, see :attr:`no_expert`
         """
         return self.batch.expert_action(0)
+
+    @property
+    def no_expert(self) -> str | None:
+        """Why the task's scripted expert cannot act here; None: it can."""
+        return self.batch.no_expert
 
     # ------------------------------------------------------------------ start states
     def get_state(self) -> StartState:
@@ -144,7 +149,7 @@ def make_maniskill_env(
     max_distance: float = 3.0,
     point_sampling: str = "random",
     point_frame: str = "world",
-    point_labels: bool = False,
+    point_labels: bool | str = False,
     max_episode_steps: int | None = None,
     ignore_terminations: bool = False,
     visuals: str = "auto",
@@ -183,7 +188,9 @@ def make_maniskill_env(
         :func:`~sb3_cpm.envs.maniskill.clouds.farthest_points`
     :param point_frame: where the points' zero is: ``"world"``, ``"base"`` of the robot, or ``"end_effector"``
     :param point_labels: a seventh column: 0 for the robot, 1, 2, ... for the other things in the order in which the scene
-        lists them, -1 for the points at the goal. Privileged: a camera does not tell this
+        lists them, -1 for the points at the goal. ``"roles"``: 1 for the thing to act on (the object; of a cabinet or faucet
+        the link that is to move), 2 for the rest of what it is a part of, 3 for other things, so that labels mean the same
+        with every cabinet. Privileged: a camera does not tell this
     :param max_episode_steps: by default the task's own (50 for PickCube)
     :param ignore_terminations: By default False: success (or failure) terminates the episode, as the task defines it and as
         evaluations want it. With positive dense rewards an agent may then learn to hover beside the goal, since success ends
@@ -242,7 +249,7 @@ def build_batch(
     max_distance: float,
     point_sampling: str,
     point_frame: str,
-    point_labels: bool,
+    point_labels: bool | str,
     max_episode_steps: int | None,
     ignore_terminations: bool,
     visuals: str,

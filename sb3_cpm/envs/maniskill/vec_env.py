@@ -177,7 +177,7 @@ class Member:
     def expert_action(self) -> np.ndarray:
         """
         :return: what the task's scripted expert does now
-        :raises ValueError: if the task has none, or none for this controller
+        :raises ValueError: if there is none, which ``no_expert`` says beforehand
         """
         return self._batch.expert_action(self._index)
 
