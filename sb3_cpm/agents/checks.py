@@ -40,7 +40,7 @@ from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.challenges import ChallengeCurator
 from sb3_cpm.dreamer.algorithm import DreamerAlgorithm
 from sb3_cpm.envs.toy import ToyEnv
-from sb3_cpm.imitation import CloneCallback
+from sb3_cpm.imitation import CloneCallback, GAILCallback
 from sb3_cpm.presets import make_preset
 from sb3_cpm.uncertainty import check_uncertainties, choose_uncertainty
 
@@ -170,7 +170,7 @@ def named_with_arguments(named: Any) -> list[tuple[str, dict[str, Any]]]:
 
 def _check_made_of(taker: Callable[..., Any], kwargs: Mapping[str, Any], where: str) -> None:
     check_arguments(where, kwargs, taker)
-    if isinstance(taker, type) and issubclass(taker, (ChallengerCallback, CloneCallback)):
+    if isinstance(taker, type) and issubclass(taker, (ChallengerCallback, CloneCallback, GAILCallback)):
         with error_prefix(where):
             taker(**kwargs)  # checks its arguments, and makes nothing before learn()
 
