@@ -411,8 +411,8 @@ class GAILCallback(StatefulCallback):
             if episode is None or buffer.books.n_steps - played.last_step > buffer.buffer_size:
                 raise ValueError(
                     f"The replay buffer, of {buffer.buffer_size} transitions per environment, has lost an episode of the "
-                    "rollout that ends here, before the discriminator could learn from it: give a buffer_size of more than n_envs "
-                    "x the rollout and the longest episode, or a smaller train_freq."
+                    "rollout that ends here, before the discriminator could learn from it: give a buffer_size of more than "
+                    "n_envs x the rollout and the longest episode, or a smaller train_freq."
                 )
             self._round.append(episode)
             self._shows(played.instance)
