@@ -12,7 +12,7 @@ SHELL := /bin/bash
 
 VENV := .venv
 SB3_TESTS := .sb3_tests
-EXTRAS := run,maniskill,contrib,tests,dev
+EXTRAS := run,maniskill,contrib,datasets,tests,dev
 CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
 
 ifeq ($(ENV),active)

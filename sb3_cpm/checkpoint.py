@@ -115,9 +115,11 @@ def _write(new: Path, model: BaseAlgorithm, callbacks: Sequence[BaseCallback], e
         storable, rest = _storable(callback.arguments)
         progress = callback.state_dict()["progress"]
         content["challengers"][str(index)] = {"arguments": storable, "not stored": rest, "progress": pack(progress)}
+    content["callbacks"] = {}
     for index, other in enumerate(callbacks):
         if isinstance(other, StatefulCallback) and other.has_state:
             other.save(new / _callback_file(index))
+            content["callbacks"][str(index)] = type(other).__name__
     content["files"] = [STATE, *(path.name for path in sorted(new.iterdir()))]
     write_archive(new / STATE, content, arrays)  # the last one: where it is, all are
 

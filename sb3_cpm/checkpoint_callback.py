@@ -38,6 +38,7 @@ from sb3_cpm.callbacks import ChallengerCallback
 from sb3_cpm.files import Archive, LockedError, NotFiniteError, NotWrittenError, disk_errors_named, locked
 from sb3_cpm.packing import unpack
 from sb3_cpm.randomness import restore_random_state
+from sb3_cpm.stateful import StatefulCallback
 from sb3_cpm.training_env import learns
 
 logger = logging.getLogger(__name__)
@@ -49,9 +50,9 @@ TERMINATED = 128 + 15
 class CheckpointCPMCallback(BaseCallback):
     """
     Saves everything that a run needs to go on, in one folder, every ``save_freq`` calls of ``env.step()`` and at the end of
-    ``learn()``: model, replay buffer with its challenges and coefficients, challenger, the statistics of a ``VecNormalize``,
-    counters, and the states of all random generators. :func:`resume` goes on from there. Also for Dreamer and Plan2Explore,
-    for other buffers of SB3's, and for on-policy algorithms.
+    ``learn()``: model, replay buffer with its challenges and coefficients, challenger, the discriminator and rings of a
+    ``GAILCallback``, the statistics of a ``VecNormalize``, counters, and the states of all random generators. :func:`resume`
+    goes on from there. Also for Dreamer and Plan2Explore, for other buffers of SB3's, and for on-policy algorithms.
 
     A checkpoint is made between two rollouts, the first time after it is due, and takes the place of the one before only when
     it is whole. Where that cannot be (the disk is full or read-only, a weight is not finite, another process is writing the
@@ -134,7 +135,7 @@ class CheckpointCPMCallback(BaseCallback):
             self._terminate()
         if self.exact and (due or self._begins):
             assert self.model.seed is not None
-            checkpoints.fresh_start(self.model, self.model.seed, self._challengers())
+            checkpoints.fresh_start(self.model, self.model.seed, self._with_state())
         self._begins = False
 
     def _on_step(self) -> bool:
@@ -153,9 +154,10 @@ class CheckpointCPMCallback(BaseCallback):
         self._listener.close()
         raise SystemExit(TERMINATED)
 
-    def _challengers(self) -> list[ChallengerCallback]:
-        """Of this ``learn()``."""
-        return [callback for callback in _flat(self.locals["callback"]) if isinstance(callback, ChallengerCallback)]
+    def _with_state(self) -> list[BaseCallback]:
+        """Those of this ``learn()`` that a checkpoint keeps, a challenger first."""
+        kept = [one for one in _flat(self.locals["callback"]) if isinstance(one, (ChallengerCallback, StatefulCallback))]
+        return sorted(kept, key=lambda one: not isinstance(one, ChallengerCallback))
 
     def _save(self) -> None:
         steps = self.model.num_timesteps
@@ -164,7 +166,7 @@ class CheckpointCPMCallback(BaseCallback):
                 self.folder.mkdir(parents=True, exist_ok=True)
             with locked(self.folder):
                 extra = {"steps": steps, "exact": self.exact}
-                checkpoints.save_checkpoint(self.folder, self.model, self._challengers(), extra)
+                checkpoints.save_checkpoint(self.folder, self.model, self._with_state(), extra)
         except (NotWrittenError, NotFiniteError, LockedError) as error:
             logger.warning(f"No checkpoint at step {steps}, the run goes on: {error}")
             return
@@ -222,7 +224,7 @@ class _Listener:
 def resume(
     folder: str | os.PathLike,
     env: GymEnv,
-    callback: ChallengerCallback | None = None,
+    callback: BaseCallback | None = None,
     device: th.device | str = "auto",
     model_class: type[BaseAlgorithm] | None = None,
     custom_objects: dict[str, Any] | None = None,
@@ -241,11 +243,12 @@ def resume(
     :param folder: as given to :class:`CheckpointCPMCallback`
     :param env: like the one that the run had: same spaces, same number of environments, same wrappers; a ``VecNormalize`` gets
         its statistics back
-    :param callback: made as the run's was; only needed where that had a function or a class as argument, which no file holds
+    :param callback: made as the run's was; needed for a ``GAILCallback``, and for a ``ChallengerCallback`` that had a function
+        or a class as argument, which no file holds
     :param device: PyTorch device; "auto" for both: a GPU if there is one
     :param model_class: only needed where it cannot be imported by its name
     :param custom_objects: SB3's: attributes of the model, ``{"policy_class": MyPolicy}``, that cannot be read here
-    :return: the model, and its ChallengerCallback; a Dreamer, or a run without challenger, has None in its place
+    :return: the model, and its callback; a Dreamer, or a run without challenger, has None in its place
     :raises ValueError: if there is no whole checkpoint, or it belongs to another environment; the message has the cure
     """
     folder = Path(folder)
@@ -260,7 +263,7 @@ def resume(
     kind = _class_of(content["model_class"], checkpoint) if model_class is None else model_class
     venv = kind._wrap_env(env, verbose=0)
     _check_env(checkpoint, _attributes(checkpoint / checkpoints.MODEL, custom_objects), content, venv)
-    callbacks = _made_again(checkpoint, content["challengers"], callback, device)
+    callbacks = _made_again(checkpoint, content, callback, device)
     model = kind.load(checkpoint / checkpoints.MODEL, venv, device=device, custom_objects=custom_objects)
     if model.seed is not None:  # not once more the start states that the run began with
         venv.seed(checkpoints.seed_at(model.num_timesteps, model.seed, model.n_envs))
@@ -347,9 +350,20 @@ def _check_env(checkpoint: Path, data: dict[str, Any], content: dict[str, Any], 
 
 
 def _made_again(
-    checkpoint: Path, saved: dict[str, Any], callback: ChallengerCallback | None, device: th.device | str
-) -> list[ChallengerCallback]:
-    """:return: the callback of the run, whose challenger is yet to come, or nothing if it had none"""
+    checkpoint: Path, content: dict[str, Any], callback: BaseCallback | None, device: th.device | str
+) -> list[BaseCallback]:
+    """:return: the callback of the run, whose state is yet to come, or nothing if it had none"""
+    saved, others = content["challengers"], content.get("callbacks", {})
+    if others:
+        name = " and ".join(["ChallengerCallback"] * len(saved) + sorted(others.values()))
+        if len(saved) + len(others) > 1:
+            raise ValueError(f"{checkpoint} was made with {name}, and resume() goes on with one callback.")
+        if type(callback).__name__ != name:
+            raise ValueError(
+                f"{checkpoint} was made with a {name}: make it once more as it was, resume(folder, env, callback={name}(...))."
+            )
+        assert callback is not None
+        return [callback]
     if not saved:
         if callback is not None:
             raise ValueError(f"{checkpoint} was made without a challenger: leave out `callback`.")

@@ -1,6 +1,7 @@
 """GAIL beside stock agents: discriminators, the expert's rings, and rewards that are computed when the player samples."""
 
 import copy
+import dataclasses
 import pickle
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cpm import ChallengerCallback, CPMBuffer
+from sb3_cpm import ChallengerCallback, CheckpointCPMCallback, CPMBuffer, resume
 from sb3_cpm.agents import load_agent
 from sb3_cpm.buffers import Demonstration
 from sb3_cpm.envs import DictObservation, ToyEnv
@@ -28,7 +29,7 @@ from sb3_cpm.imitation import (
     VectorDiscriminator,
     record_demonstrations,
 )
-from sb3_cpm.run import train
+from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.training_env import begin_episodes
 
 N_POINTS = 40
@@ -271,19 +272,14 @@ def test_rewards_are_never_stale_and_never_stored(demonstrations: Any) -> None:
     assert b"discriminator" not in pickle.dumps(model.replay_buffer)
 
 
-def test_the_environments_reward_alone_is_sac(demonstrations: Any) -> None:
-    runs = []
+def test_the_environments_reward_alone_is_sac_bit_for_bit(demonstrations: Any) -> None:
+    players = []
     for callback in (None, gail(demonstrations, env_reward=1.0, expert_reward=0.0, demonstrations_for_player=False)):
         model = make(reach())
         model.learn(300, callback=callback)
-        runs.append(model)
-    # the discriminator draws random numbers of its own, from the same generators: only what comes before its first round
-    assert (runs[0].replay_buffer.actions[:60] == runs[1].replay_buffer.actions[:60]).all()
-    batches = []
-    for model in runs:
-        np.random.seed(0)
-        batches.append(model.replay_buffer.sample(32).rewards)
-    assert set(batches[1].unique().tolist()) <= {0.0, 1.0}
+        players.append([*model.policy.parameters(), th.from_numpy(model.replay_buffer.actions[:300])])
+    assert callback is not None and int(callback.discriminator.updates) == 25  # type: ignore[arg-type]
+    assert all(th.equal(a, b) for a, b in zip(*players, strict=True))
 
 
 def test_an_exception_ends_it(demonstrations: Any) -> None:
@@ -294,7 +290,46 @@ def test_an_exception_ends_it(demonstrations: Any) -> None:
     model = make(reach())
     with pytest.raises(KeyError):
         model.learn(400, callback=[gail(demonstrations), Look(fail)])
-    assert model.replay_buffer.reward_of is None
+    assert model.replay_buffer.reward_of is None and model.replay_buffer.demonstrations.reward_of is None
+    assert set(np.unique(model.replay_buffer.sample(100).rewards)) <= {0.0, 1.0}
+
+
+def test_the_newest_transitions_of_a_round_are_learnt_from(demonstrations: Any) -> None:
+    callback, ages = gail(demonstrations, episodes_per_round=3, recent_transitions=40), []
+
+    def recent() -> Any:
+        observations, actions = GAILCallback._recent(callback)
+        books, buffer = callback.buffer.books, callback.buffer
+        steps = np.arange(books.n_steps - 40, books.n_steps) % buffer.buffer_size
+        ages.append((actions == buffer.actions[steps, 0]).all() and len(observations["state"]) == 40)
+        return observations, actions
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callback, "_recent", recent)
+        make(reach()).learn(300, callback=callback)
+    assert ages == [True, True, True]
+
+
+def test_learning_in_portions_that_end_amid_episodes(demonstrations: Any) -> None:
+    callback, model = gail(demonstrations), make(reach())
+    for steps, reset in ((110, True), (100, False), (110, True)):  # the last one begins new episodes
+        model.learn(steps, callback=callback, reset_num_timesteps=reset)
+    assert int(callback.discriminator.updates) == 5 * 5  # 30 x 3 + 20 (goes on), 10 (goes on) + 30 x 3; cut; 30 x 3
+    assert len(callback._round) == 0
+    model.learn(20, callback=callback, reset_num_timesteps=False)
+    assert len(callback._round) == 1
+    other = make(reach())
+    with pytest.warns(UserWarning, match="none of the demonstrations that the discriminator knows"):
+        other.learn(40, callback=callback)  # the episode of another player's buffer is none of this round
+    assert len(callback._round) == 1 and callback._round[0] in other.replay_buffer.episodes
+
+
+def test_a_buffer_that_loses_episodes_before_they_are_learnt_from(demonstrations: Any) -> None:
+    model = make(reach())
+    model.replay_buffer = CPMBuffer(40, model.observation_space, model.action_space, challenge_ratio=0)
+    model.train_freq = model.train_freq._replace(frequency=100)
+    with pytest.raises(ValueError, match="40 transitions per environment, has lost an episode.*smaller train_freq"):
+        model.learn(400, callback=gail(demonstrations))
 
 
 def test_successes_join_the_expert_up_to_the_first_successful_step() -> None:
@@ -336,23 +371,6 @@ def test_the_newest_of_a_round_come_last(demonstrations: Any) -> None:
     assert [episode.ordinal for episode in callback._round] == list(range(6))
 
 
-def test_a_run_that_was_cut_off_goes_on(tmp_path: Path) -> None:
-    small: dict[str, Any] = {"env": "CPMReach-v0", "agent": "gail_sac", "steps": 400, "evaluations": 2, "eval_episodes": 1}
-    small |= {"checkpoint_freq": 100, "video": False, "device": "cpu"}
-
-    def fail(model: Any) -> None:
-        raise KeyError("somebody else's")
-
-    train(run_folder=str(tmp_path / "unbroken"), **small)
-    with pytest.raises(KeyError):
-        train(run_folder=str(tmp_path / "broken"), **small, callback=Look(fail, at=250))
-    assert train(resume=str(tmp_path / "broken")).outcome == "finished"
-    broken, unbroken = (
-        {path.name: path.read_bytes() for path in sorted((tmp_path / name).glob("*.csv"))} for name in ("broken", "unbroken")
-    )
-    assert broken == unbroken and b"gail/" in broken["diagnostics.csv"]
-
-
 @pytest.mark.parametrize("algorithm", [SAC, TD3])
 def test_one_seed_is_one_run(demonstrations: Any, algorithm: Any) -> None:
     finals = []
@@ -388,6 +406,73 @@ def test_save_and_load(demonstrations: Any, tmp_path: Path) -> None:
         )
 
 
+def kept(callback: GAILCallback) -> list[Any]:
+    """What of it must be the same in two runs."""
+    assert callback.discriminator is not None and callback.expert is not None and callback.optimizer is not None
+    moments = [one for entry in callback.optimizer.state_dict()["state"].values() for one in entry.values()]
+    rings = [array for _, array in sorted(callback.expert.state("")[1].items()) if array.dtype.kind == "f"]
+    return [*callback.discriminator.state_dict().values(), *moments, *(th.from_numpy(one.copy()) for one in rings)]
+
+
+class Stop(BaseCallback):
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.step:
+            raise InterruptedError
+        return True
+
+
+@pytest.mark.parametrize("stop", [200, 350])
+def test_a_killed_run_that_goes_on_is_the_unbroken_one(stop: int, demonstrations: Any, tmp_path: Path) -> None:
+    """
+    Checkpoints at 100, 200, ... cut episodes of 30 steps, in the unbroken run as well. 200: learn() came to its end there;
+    350: killed, and all is lost back to 300.
+    """
+
+    def callbacks(folder: str, callback: GAILCallback) -> list[BaseCallback]:
+        return [callback, CheckpointCPMCallback(50, tmp_path / folder, exact=True)]
+
+    first, unbroken = gail(demonstrations, episodes_per_round=3), make(reach(2))
+    unbroken.learn(500, callback=callbacks("unbroken", first))
+    broken = callbacks("broken", gail(demonstrations, episodes_per_round=3))
+    if stop % 100:
+        with pytest.raises(InterruptedError):
+            make(reach(2)).learn(500, callback=[*broken, Stop(stop)])
+    else:
+        make(reach(2)).learn(stop, callback=broken)
+    again = gail(demonstrations, episodes_per_round=3)
+    model, same = resume(tmp_path / "broken", reach(2), callback=again)
+    assert same is again and model.num_timesteps == stop // 100 * 100
+    model.learn(500 - model.num_timesteps, callback=callbacks("broken", again), reset_num_timesteps=False)
+    assert int(first.discriminator.updates) >= 10
+    ours, theirs = kept(again), kept(first)
+    assert len(ours) == len(theirs) and all(th.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    assert all(th.equal(a, b) for a, b in zip(model.policy.parameters(), unbroken.policy.parameters(), strict=True))
+    for wrong in (None, ChallengerCallback()):
+        with pytest.raises(ValueError, match=r"was made with a GAILCallback.*callback=GAILCallback\(...\)"):
+            resume(tmp_path / "unbroken", reach(2), callback=wrong)
+
+
+@pytest.mark.slow
+def test_train_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3")
+    few = {"n_episodes": 6, "discriminator_class": "vector", "preset": "small", "episodes_per_round": 2}
+    settings: dict[str, Any] = {
+        **{"agent": "gail_sac", "env": "CPMReach-v0", "steps": 600, "evaluations": 2, "eval_episodes": 5, "video": False},
+        **{"checkpoint_freq": 100, "device": "cpu"},
+        "model_kwargs": {"callback": [{"sb3_cpm.imitation.GAILCallback": few}]},
+    }
+    train(run_folder=str(tmp_path / "unbroken"), **settings)
+    with pytest.raises(InterruptedError):
+        train(run_folder=str(tmp_path / "broken"), callback=Stop(350), **settings)
+    assert train(TrainSettings(resume=str(tmp_path / "broken"))).outcome == "finished"
+    for table in (tmp_path / "unbroken").glob("*.csv"):
+        assert table.read_bytes() == (tmp_path / "broken" / table.name).read_bytes()
+
+
 def test_the_agent_learns_clouds_and_grows(tmp_path: Path) -> None:
     built = load_agent("gail_sac", "CPMToy-v0").build(seed=0, device="cpu")
     (callback,) = built.callbacks
@@ -395,6 +480,47 @@ def test_the_agent_learns_clouds_and_grows(tmp_path: Path) -> None:
     built.model.learn(400, callback=callback)
     assert callback.discriminator.alpha == 1.0 and int(callback.discriminator.updates) == 40
     assert callback.expert.instances == ["any"]
+
+
+# ---------------------------------------------------------------------- learning
+
+
+def without_information(demonstrations: list[Demonstration]) -> list[Demonstration]:
+    """Each number of states and actions is shuffled among rows: all have the distributions that they had, and nothing to do
+    with each other."""
+    generator = np.random.default_rng(0)
+    actions = generator.permuted(np.concatenate([one.actions for one in demonstrations]), axis=0)
+    states = generator.permuted(np.concatenate([one.observations["state"] for one in demonstrations]), axis=0)
+    return [
+        dataclasses.replace(one, actions=actions[30 * i : 30 * i + 30], observations={"state": states[31 * i : 31 * i + 31]})
+        for i, one in enumerate(demonstrations)
+    ]
+
+
+def success_at_end(choose: Any) -> float:
+    """:return: share of 50 episodes"""
+    env, found = make_vec_env("CPMReach-v0", n_envs=10, seed=3_000_000), []
+    obs: Any = env.reset()
+    while len(found) < 50:
+        obs, _, dones, infos = env.step(choose(obs))
+        found += [info["is_success"] for info, done in zip(infos, dones, strict=True) if done]
+    return float(np.mean(found))
+
+
+@pytest.mark.slow
+def test_it_learns_from_demonstrations_alone_and_not_from_noise() -> None:
+    found = {}
+    recorded = record_demonstrations(reach(), 20, seed=7, hold=True)
+    for name, episodes in (("demonstrations", recorded), ("noise", without_information(recorded))):
+        built = load_agent("gail_sac", "CPMReach-v0").build(seed=7, device="cpu")
+        (callback,) = built.callbacks
+        callback.demonstrations, callback.n_episodes = episodes, None
+        built.model.learn(5000, callback=callback)
+        model = built.model
+        found[name] = success_at_end(lambda obs, model=model: model.predict(obs, deterministic=True)[0])
+    generator = np.random.default_rng(0)
+    found["random"] = success_at_end(lambda obs: generator.uniform(-1, 1, (10, 2)))
+    assert found["demonstrations"] > 0.5 and found["random"] < 0.1 and found["noise"] < 0.3, found
 
 
 # ---------------------------------------------------------------------- bad input
@@ -409,6 +535,7 @@ def learn(model: Any, *callbacks: Any) -> None:
     [
         (lambda d: GAILCallback(d, env_reward=0.0, expert_reward=0.0), "both 0"),
         (lambda d: GAILCallback(d, env_reward=-1.0), "env_reward must be"),
+        (lambda d: GAILCallback(d, label_smoothing=0.5), "label_smoothing must be a number from 0 up to"),
         (lambda d: GAILCallback(d, discriminator_class="vectors"), "'vectors'.*'vector'"),
         (lambda d: GAILCallback(d, discriminator_kwargs={"size": 3}), "size"),
         (
@@ -445,7 +572,53 @@ def test_an_environment_that_does_not_tell_success() -> None:
     env = DummyVecEnv([lambda: Silent(gym.make("CPMReach-v0"))])
     with pytest.raises(ValueError, match="neither 'is_success' nor 'success'"):
         learn(make(env), gail(demonstrations))
-    learn(make(env), gail(demonstrations, self_imitation=False))
+    learn(make(env), gail(demonstrations, self_imitation=False, balance=False))
+
+
+def renamed(demonstrations: list[Demonstration], name: str | None) -> list[Demonstration]:
+    return [dataclasses.replace(one, instance=name) for one in demonstrations]
+
+
+@pytest.mark.parametrize(
+    "name, balance, message",
+    [
+        (None, True, "names an object, '(strong|medium|weak)', and demonstrations name none.*balance=False"),
+        ("broken", True, "In 10 episodes the environment has not shown broken, of which there are demonstrations"),
+        (None, False, None),
+    ],
+)
+def test_instances_that_the_environment_does_not_have(
+    demonstrations: Any, name: str | None, balance: bool, message: str | None
+) -> None:
+    callback = gail(renamed(demonstrations, name), balance=balance)
+    model = make(reach())
+    if message is None:
+        model.learn(400, callback=callback)
+    else:
+        with pytest.warns(UserWarning, match=message) as caught:
+            model.learn(400, callback=callback)
+        assert len(caught) == 1
+
+
+def test_demonstrations_of_instances_where_the_environment_names_none(demonstrations: Any) -> None:
+    class Nameless(gym.Wrapper):
+        def step(self, action: Any) -> Any:
+            *outcome, info = self.env.step(action)
+            return *outcome, {"is_success": info["is_success"]}
+
+    with pytest.warns(UserWarning, match="names none .* and demonstrations name .*medium"):
+        make(DummyVecEnv([lambda: Nameless(gym.make("CPMReach-v0"))])).learn(100, callback=gail(demonstrations))
+
+
+def test_parts_that_no_point_has() -> None:
+    net = ProgressiveDiscriminator(CLOUDS, ACTIONS, parts=(0, 7), **SMALL)
+    with pytest.raises(ValueError, match=r"parts=\[0, 7\]: no point .* has the label 7, theirs are \[-1, 0, 1, 2\]"):
+        net.observe(clouds(5)[0])
+
+
+def test_a_loss_that_is_not_finite(demonstrations: Any) -> None:
+    with pytest.raises(ValueError, match="loss is nan in its update 2.*lower learning_rate"):
+        make(reach()).learn(300, callback=gail(demonstrations, learning_rate=1e30))
 
 
 def test_episodes_that_end_early_are_told() -> None:

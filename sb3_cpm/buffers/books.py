@@ -57,11 +57,6 @@ class EpisodeBooks:
         """Complete episodes, by environment, oldest first."""
         return [episode for episodes in self._episodes for episode in episodes]
 
-    def newest(self, env_idx: int, n: int) -> list[Episode]:
-        """:return: the n complete episodes of an environment that ended last, oldest first"""
-        episodes = self._episodes[env_idx]
-        return [episodes[-k] for k in range(n, 0, -1)]
-
     @property
     def n_drawable(self) -> int:
         """Transitions of complete episodes, of all environments."""

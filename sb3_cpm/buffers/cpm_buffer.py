@@ -286,7 +286,7 @@ class CPMBuffer(EpisodeBuffer):
         assert self.demonstrations is not None
         # SB3 sets a loaded buffer's device, and knows nothing of a second one in it
         self.demonstrations.player_keys, self.demonstrations.device = self.player_keys, self.device
-        self.demonstrations.attach_reward(self.reward_of, self.reward_keys)
+        self.demonstrations.attach_reward(self._reward, self.reward_keys, self._reward_is_on)
         return self.demonstrations
 
     def _shares(self, batch_size: int) -> tuple[int, int]:

@@ -219,6 +219,16 @@ class ProgressiveDiscriminator(Discriminator):
         return self.out(simple).squeeze(1)
 
     def observe(self, observations: Observations) -> None:
+        """
+        :raises ValueError: for a part that no point of the expert belongs to
+        """
+        labels = observations[self.cloud][..., -1].round().unique().long().tolist()
+        strange = [part for part in self.parts if part not in labels]
+        if strange:
+            raise ValueError(
+                f"parts={list(self.parts)}: no point of the demonstrations has the label {strange[0]}, theirs are {labels}. "
+                "Name parts among those in discriminator_kwargs."
+            )
         self.of_points.observe(observations[self.cloud].float()[..., :3].flatten(0, 1))
         self.of_state.observe(self._state(observations))
 

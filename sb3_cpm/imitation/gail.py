@@ -7,8 +7,8 @@ who is joined by the player's own successes.
 import math
 import sys
 import warnings
-from collections import Counter
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +31,7 @@ from sb3_cpm.arguments import (
     integer,
     names_checked,
     nearest,
+    number,
 )
 from sb3_cpm.buffers import CPMBuffer, Demonstration, Episode, EpisodeBuffer
 from sb3_cpm.buffers.compact import StorageSpec
@@ -38,15 +39,19 @@ from sb3_cpm.buffers.demonstrations import as_arrays
 from sb3_cpm.files import Archive, check_finite, write_archive
 from sb3_cpm.imitation.callback import demonstrations_for
 from sb3_cpm.imitation.discriminator import DISCRIMINATORS, Discriminator, Observations, softplus_reward
-from sb3_cpm.imitation.instance_buffer import InstanceBuffer
+from sb3_cpm.imitation.instance_buffer import ANY, InstanceBuffer
 from sb3_cpm.imitation.loading import Source
 from sb3_cpm.packing import pack, unpack
 from sb3_cpm.player import max_episode_steps
+from sb3_cpm.randomness import own_randomness
 from sb3_cpm.stateful import StatefulCallback
 from sb3_cpm.training_env import learns, success_of
 
 #: Expert rows that the scale of a discriminator's inputs is taken from.
 SCALE_ROWS = 4096
+#: Episodes of the player per demonstrated object, after which all should have been shown: of k that are equally likely, one is
+#: missing with a probability below k * exp(-10).
+EPISODES_PER_INSTANCE = 10
 #: What presets set, unless it is given: the paper's sizes, for GPUs, and some that two cores can bear.
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {"batch_size": 1024, "quota": 30_000, "progressive": {}},
@@ -61,15 +66,18 @@ PRESETS: dict[str, dict[str, Any]] = {
 @dataclass(frozen=True)
 class Played:
     """
-    An episode of the player that has ended.
+    An episode of the player that has ended. Steps are numbered as the player's buffer counts them, from its first on: where
+    an episode begins is the buffer's to say, which also ends those that a checkpoint or another ``learn()`` cuts.
 
     :param env_idx: environment that it was played in
-    :param first_success: step that led to the first success; None without
+    :param last_step: number of its last step
+    :param successes: numbers of steps that led to a success, in order; the first may be of an episode that was cut
     :param instance: which object it was about, as the environment names it
     """
 
     env_idx: int
-    first_success: int | None
+    last_step: int
+    successes: list[int]
     instance: str | None
 
 
@@ -117,7 +125,7 @@ class GAILCallback(StatefulCallback):
     :param gradient_penalty: weight of a penalty on interpolated rows [0]
     :param label_smoothing: [0]
     :param storage_dtypes: compact storage in the rings, see :class:`~sb3_cpm.buffers.CPMBuffer`
-    :param seed: of an expert; None: the model's
+    :param seed: of an expert, and of the discriminator's own random numbers; None: the model's
     :param load_path: of :meth:`save`, to start from
     :param device: PyTorch device of the discriminator; "auto": the model's
     :param verbose: as SB3's callbacks have it
@@ -170,7 +178,12 @@ class GAILCallback(StatefulCallback):
         check_each(integer(1), episodes_per_round=episodes_per_round, gradient_steps=gradient_steps, quota=quota)
         check_each(integer(1), batch_size=self.batch_size, recent_transitions=recent_transitions)
         check_each(AT_LEAST_0, env_reward=env_reward, expert_reward=expert_reward, gradient_penalty=gradient_penalty)
-        check_each(SHARE, label_smoothing=label_smoothing, keep_demonstrations=keep_demonstrations)
+        check("keep_demonstrations", keep_demonstrations, SHARE)
+        check(
+            "label_smoothing",
+            label_smoothing,
+            number("a number from 0 up to, but without 0.5", lambda value: 0.0 <= value < 0.5),
+        )
         check("learning_rate", learning_rate, ABOVE_0)
         check("weight_decay", weight_decay, AT_LEAST_0)
         if env_reward == 0 and expert_reward == 0:
@@ -208,7 +221,11 @@ class GAILCallback(StatefulCallback):
         self.n_successes = 0
         self._round: list[Episode] = []
         self._played: list[Played] = []
-        self._first_success: list[int | None] = []
+        self._successes: list[list[int]] = []  # of the episodes that go on, by environment
+        self._shown: dict[str, int] = {}  # instances of the player's episodes, and how many there were of each
+        self._demonstrated: list[str] = []  # instances of the demonstrations
+        self._of: EpisodeBuffer | None = None  # the buffer that episodes and steps belong to
+        self._entropy: int | None = None
         self._told: set[str] = set()
 
     # ------------------------------------------------------------------ coming and going
@@ -218,6 +235,16 @@ class GAILCallback(StatefulCallback):
         """The player's."""
         return self.model.replay_buffer  # type: ignore[attr-defined]
 
+    def _randomness(self, *words: int) -> AbstractContextManager[None]:
+        """
+        Random numbers of its own, so that a player who learns from the environment's rewards alone has those that it would
+        have had, and a resumed run draws what an unbroken one does.
+
+        :param words: what they are for
+        """
+        assert self._entropy is not None
+        return own_randomness(self._entropy, *words)
+
     def _init_callback(self) -> None:
         _check_model(self.model)
         if self.discriminator is not None:
@@ -225,13 +252,16 @@ class GAILCallback(StatefulCallback):
         space, action_space = self.model.observation_space, self.model.action_space
         assert isinstance(space, spaces.Dict) and isinstance(action_space, spaces.Box)
         device = self.model.device if self.device == "auto" else th.device(self.device)
-        with error_prefix("GAILCallback"):
+        seed = self.model.seed if self.seed is None else self.seed
+        self._entropy = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        with error_prefix("GAILCallback"), self._randomness():
             self.discriminator = self.discriminator_class(space, action_space, **self.discriminator_kwargs).to(device)
         self.optimizer = th.optim.Adam(self.discriminator.parameters(), self.learning_rate, weight_decay=self.weight_decay)
         read = spaces.Dict({key: space[key] for key in self.discriminator.keys})
         self.expert = InstanceBuffer(read, action_space, device=device, **self.ring_kwargs)
         if self.load_path is not None:
             self.load(self.load_path)
+            self._round, self._of = [], None  # episodes of another player
 
     def _on_training_start(self) -> None:
         assert self.discriminator is not None and self.expert is not None
@@ -244,7 +274,8 @@ class GAILCallback(StatefulCallback):
         elif isinstance(buffer, CPMBuffer) and self.demonstrations_for_player and buffer.demonstrations is None:
             warnings.warn("The player's buffer has none of the demonstrations that the discriminator knows.", stacklevel=2)
         self.discriminator.plan(self._planned_updates())
-        self._first_success = [None] * model.n_envs
+        if self._of is not buffer:
+            self._of, self._round, self._successes = buffer, [], [[] for _ in range(model.n_envs)]
         self._played = []
         buffer.attach_reward(self.player_rewards, self.discriminator.keys, lambda: learns(model, sys._getframe()))
 
@@ -260,6 +291,10 @@ class GAILCallback(StatefulCallback):
             buffer.add_demonstrations(episodes)
         for demonstration, arrays in zip(episodes, as_arrays(episodes, space, self.model.action_space), strict=True):
             self.expert.add(demonstration.instance, arrays[0], arrays[1], demonstration=True)
+        self._demonstrated = self.expert.instances
+        assert self.discriminator is not None
+        with error_prefix("GAILCallback"), self._randomness(0):
+            self.discriminator.observe(self.expert.sample(SCALE_ROWS)[0])
         if self.reward == "softplus" and any(episode.terminated for episode in episodes):
             self._warn_of_ends("demonstrations")
 
@@ -336,21 +371,19 @@ class GAILCallback(StatefulCallback):
     # ------------------------------------------------------------------ what it learns from
 
     def _on_step(self) -> bool:
-        books = self.buffer.books  # which SB3 is about to give this transition
+        step = self.buffer.books.n_steps  # the buffer is given this step after the callbacks
         for i, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
-            step = books.n_steps - int(books.began[i])  # of its episode
-            if step == 0:  # the one before may have been cut off, by a checkpoint for instance
-                self._first_success[i] = None
             success = success_of(info)
             if success is None and self.self_imitation:
                 raise ValueError(
                     "self_imitation needs to know which episodes succeed, and the environment's infos have neither "
                     "'is_success' nor 'success'. Wrap it in one that adds it, or give GAILCallback self_imitation=False."
                 )
-            if success and self._first_success[i] is None:
-                self._first_success[i] = step
+            if success:
+                self._successes[i].append(step)
             if done:
-                self._played.append(Played(i, self._first_success[i], info.get("instance")))
+                self._played.append(Played(i, step, self._successes[i], info.get("instance")))
+                self._successes[i] = []
                 if self.reward == "softplus" and not info.get("TimeLimit.truncated", False):
                     self._warn_of_ends("episodes of the player")
         return True
@@ -368,20 +401,57 @@ class GAILCallback(StatefulCallback):
             self._played = []
 
     def _take_episodes(self) -> None:
-        """Those that ended in this rollout: they are the newest of their environments."""
+        """Those that ended in this rollout join the round, and the expert those with a success, up to the first."""
         assert self.expert is not None and self.discriminator is not None
-        ended = Counter(played.env_idx for played in self._played)
-        newest = {env_idx: iter(self.buffer.books.newest(env_idx, n)) for env_idx, n in ended.items()}
+        buffer = self.buffer
+        by_end = {(one.env_idx, (one.start + one.length - 1) % buffer.buffer_size): one for one in buffer.episodes}
         for played in self._played:
-            episode = next(newest[played.env_idx])
+            episode = by_end.get((played.env_idx, played.last_step % buffer.buffer_size))
+            if episode is None or buffer.books.n_steps - played.last_step > buffer.buffer_size:
+                raise ValueError(
+                    f"The replay buffer, of {buffer.buffer_size} transitions per environment, has lost an episode of the "
+                    "rollout that ends here, before the discriminator could learn from it: give a buffer_size of more than "
+                    "n_envs x the rollout and the longest episode, or a smaller train_freq."
+                )
             self._round.append(episode)
-            if self.self_imitation and played.first_success is not None:
-                n = played.first_success + 1
-                states = self.buffer.episode_observations(episode, self.discriminator.keys)
-                actions = self.buffer.episode_actions(episode)
+            self._shows(played.instance)
+            first_step = played.last_step - episode.length + 1
+            until_success = [step - first_step + 1 for step in played.successes if step >= first_step][:1]
+            if self.self_imitation and until_success:
+                n = until_success[0]
+                states = buffer.episode_observations(episode, self.discriminator.keys)
+                actions = buffer.episode_actions(episode)
                 self.expert.add(played.instance, {key: rows[: n + 1] for key, rows in states.items()}, actions[:n])
                 self.n_successes += 1
                 self.logger.record("gail/successes_added", self.n_successes)
+
+    def _shows(self, instance: str | None) -> None:
+        """Demonstrations of objects that the environment lacks, or calls otherwise, would have their share of each batch."""
+        assert self.expert is not None
+        name = ANY if instance is None else instance
+        self._shown[name] = self._shown.get(name, 0) + 1
+        if not self.expert.balance or "instances" in self._told:
+            return
+        named, without = instance is not None, ANY in self._demonstrated
+        if named == without:
+            self._told.add("instances")
+            told = f"an object, {instance!r}" if named else "none (there is no infos[i]['instance'])"
+            theirs = "name none" if without else f"name {', '.join(self._demonstrated)}"
+            warnings.warn(
+                f"The environment names {told}, and demonstrations {theirs}: the player's successes get rings of their own. "
+                "Give each Demonstration the `instance` that the environment names, or GAILCallback balance=False.",
+                stacklevel=2,
+            )
+        elif sum(self._shown.values()) >= EPISODES_PER_INSTANCE * len(self._demonstrated):
+            self._told.add("instances")
+            absent = [one for one in self._demonstrated if one not in self._shown]
+            if absent:
+                warnings.warn(
+                    f"In {sum(self._shown.values())} episodes the environment has not shown {', '.join(absent)}, of which "
+                    f"there are demonstrations: a share of the expert's rows is about what the player never sees. It has "
+                    f"shown {', '.join(self._shown)}.",
+                    stacklevel=2,
+                )
 
     def _recent(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """The newest transitions of the round that the player's buffer still holds."""
@@ -395,14 +465,13 @@ class GAILCallback(StatefulCallback):
     def _train_discriminator(self) -> None:
         assert self.discriminator is not None and self.expert is not None and self.optimizer is not None
         device = next(self.discriminator.parameters()).device
-        if int(self.discriminator.updates) == 0:
-            self.discriminator.observe(self.expert.sample(SCALE_ROWS)[0])
         recent, taken = self._recent()
-        for _ in range(self.gradient_steps):
-            observations, actions = self.expert.sample(self.batch_size)
-            rows = np.random.randint(len(taken), size=len(actions))
-            of_player = {key: th.as_tensor(one[rows], device=device) for key, one in recent.items()}
-            self._update((observations, actions), (of_player, th.as_tensor(taken[rows], device=device)))
+        with self._randomness(1, int(self.discriminator.updates)):
+            for _ in range(self.gradient_steps):
+                observations, actions = self.expert.sample(self.batch_size)
+                rows = np.random.randint(len(taken), size=len(actions))
+                of_player = {key: th.as_tensor(one[rows], device=device) for key, one in recent.items()}
+                self._update((observations, actions), (of_player, th.as_tensor(taken[rows], device=device)))
         sizes = self.expert.sizes()
         self.logger.record("gail/alpha", self.discriminator.alpha)
         self.logger.record("gail/updates", int(self.discriminator.updates))
@@ -489,6 +558,9 @@ class GAILCallback(StatefulCallback):
             "discriminator": self.discriminator_class.__name__,
             "rings": rings,
             "n_successes": self.n_successes,
+            "entropy": self._entropy,
+            "shown": self._shown,
+            "demonstrated": self._demonstrated,
             "round": pack(self._round, (Episode,)),
             "optimized": sorted(self.optimizer.state_dict()["state"]),
             "told": sorted(self._told),
@@ -531,6 +603,8 @@ class GAILCallback(StatefulCallback):
         self.n_successes = content["n_successes"]
         self._round = unpack(content["round"], (Episode,))
         self._told = set(content["told"])
+        self._entropy, self._shown, self._demonstrated = content["entropy"], content["shown"], content["demonstrated"]
+        self._of, self._successes = self.buffer, [[] for _ in range(self.model.n_envs)]
 
 
 def _class_of(given: Any) -> type[Discriminator]:
