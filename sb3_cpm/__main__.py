@@ -1,6 +1,6 @@
 """
-The command line: ``python -m sb3_cpm COMMAND``, of train, two-stage, demonstrate, watch, reproduce, doctor, setup-rendering
-and assets.
+The command line: ``python -m sb3_cpm COMMAND``, of demo, train, two-stage, demonstrate, watch, reproduce, doctor,
+setup-rendering and assets.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -68,6 +68,17 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="sb3-cpm", description="CPM: a challenger and a player for Stable-Baselines3.")
     parser.add_argument("--version", action="version", version=f"sb3_cpm {__version__}")
     commands = parser.add_subparsers(required=True, metavar="command")
+
+    demo = commands.add_parser(
+        "demo",
+        help="plain SAC and the same with a challenger on a sparse task: one picture, two minutes, no renderer",
+        description="Train plain SAC and the same SAC with a challenger on MountainCarContinuous-v0, side by side, and draw "
+        "where both have been and who has found the reward.",
+    )
+    demo.add_argument("--folder", default="runs/demo", help="for demo.png and demo.json (default: runs/demo)")
+    demo.add_argument("--steps", type=int, default=5000, help="environment steps of each (default: 5000)")
+    demo.add_argument("--seed", type=int, default=0, help="of both (default: 0)")
+    demo.set_defaults(command=_demo)
 
     train = commands.add_parser(
         "train",
@@ -235,6 +246,15 @@ class _KeyValues(argparse.Action):
             except yaml.YAMLError as error:
                 parser.error(f"{option_string} {pair}: the value is not YAML ({error})")
         setattr(namespace, self.dest, found)
+
+
+def _demo(**arguments: Any) -> int:
+    with needed("The demo", "run"):
+        from rich.console import Console
+
+        from sb3_cpm.run.demo import demo
+    demo(**arguments, tell=lambda news: print(news, flush=True), status=Console(stderr=True).status)
+    return 0
 
 
 def _train(**settings: Any) -> int:
