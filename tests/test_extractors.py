@@ -52,6 +52,22 @@ def test_equals_the_plain_formula_with_and_without_gradient() -> None:
         assert th.allclose(net(points), plain, atol=1e-6)
 
 
+def test_many_clouds_go_through_in_parts_with_the_same_result() -> None:
+    net = PointNet(6, (16, 512))
+    clouds = th.randn(5, 200, 6)
+    clouds[1, 40] = clouds[1, 17] = 9.0  # the first of equals is the critical one
+    assert len(net._parts(clouds)) == 3
+    with th.no_grad():
+        channels = net._project(clouds)
+        assert th.equal(th.cat([net._critical(part) for part in net._parts(clouds)]), channels.max(dim=1).indices)
+        alone = th.cat([net(cloud.unsqueeze(0)) for cloud in clouds])
+        th.testing.assert_close(net(clouds), alone, rtol=0, atol=1e-6)
+    th.testing.assert_close(net(clouds), alone, rtol=0, atol=1e-6)
+    clouds[3, 100, 2] = th.nan
+    found = net(clouds)
+    assert found[3].isnan().all() and not found[[0, 1, 2, 4]].isnan().any()
+
+
 def test_input_transform_starts_as_identity_and_learns() -> None:
     net = PointNet(6, (8, 16), input_transform=True)
     assert net.transform is not None
