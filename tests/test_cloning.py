@@ -11,12 +11,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_cpm import PointNetPolicy
-from sb3_cpm.buffers import Demonstration
+from sb3_cpm.buffers import CPMBuffer, Demonstration
 from sb3_cpm.imitation import CloneCallback, clone, record_demonstrations
 from sb3_cpm.imitation.cloning import ActionLoss, _keys_of_actor, actor_parameters
 from sb3_cpm.zoo.policies import PointNetActorCriticPolicy
@@ -338,6 +339,28 @@ def test_it_clones_once_in_a_models_life(tmp_path: Path) -> None:
     first, _, third = callback.states
     assert not changed(state_of(model.policy), loaded.policy) - set(first) and th.equal(first["log_std"], third["log_std"])
     assert changed(third, loaded.policy) >= {"log_std"}, "one round was left, then two: now all learn"
+
+
+def test_a_clone_may_wait_and_the_buffer_gets_what_it_is_made_of() -> None:
+    env = toy("state")
+    kwargs = {"challenge_ratio": 0, "demonstration_ratio": 0.5}
+    model = make(SAC, env, "MultiInputPolicy", learning_starts=100, replay_buffer_class=CPMBuffer, replay_buffer_kwargs=kwargs)
+    model.set_logger(Logger(None, []))
+    before, at = state_of(model.policy), []
+
+    class Changed(BaseCallback):
+        def _on_step(self) -> bool:
+            if changed(before, self.model.policy):
+                at.append(self.num_timesteps)
+            return True
+
+    callback = CloneCallback(n_episodes=3, n_updates=10, after_steps=40)
+    model.learn(60, [callback, Changed()])
+    assert callback.result is not None and at == list(range(41, 61))
+    assert len(model.replay_buffer.demonstrations.episodes) == 3
+    again = CloneCallback(n_episodes=3, n_updates=10, after_steps=40)
+    model.learn(20, again, reset_num_timesteps=False)
+    assert again.result is None
 
 
 def test_of_the_toys_expert_a_clone_succeeds() -> None:

@@ -1,5 +1,6 @@
 """PointNet: invariance, identity at the start, gradients, and what the player's networks never see."""
 
+import copy
 import time
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_cpm.envs.toy import ToyEnv
 from sb3_cpm.extractors import PointNet, PointNetExtractor, PointNetPolicy
+from sb3_cpm.imitation.cloning import actor_parameters
+from sb3_cpm.policies import LayerNormPolicy, RLPDPolicy
 
 SPACE = spaces.Dict(
     {
@@ -239,3 +242,68 @@ def test_images_that_are_too_small(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="14x14 pixels and more.*ResizeObservation"):
         PointNetExtractor(spaces.Dict({"camera": spaces.Box(0, 255, (*size, 3), np.uint8)}))
     PointNetExtractor(spaces.Dict({"camera": spaces.Box(0, 255, (14, 14, 3), np.uint8)}))
+
+
+# ---------------------------------------------------------------------- one extractor, the critic's
+
+
+def sharing(policy: type = PointNetPolicy, **kwargs: Any) -> SAC:
+    kwargs = {"critics_extractor": True, "net_arch": [32, 32], **kwargs}
+    return SAC(policy, ToyEnv(), buffer_size=100, learning_starts=10, batch_size=8, policy_kwargs=kwargs, seed=1, device="cpu")
+
+
+@pytest.mark.parametrize("policy", [PointNetPolicy, RLPDPolicy, LayerNormPolicy])
+def test_the_critics_loss_alone_trains_what_the_actor_reads(policy: type, tmp_path: Path) -> None:
+    model = sharing(policy)
+    actor, critic = model.actor, model.critic
+    assert actor.features_extractor is critic.features_extractor is not model.critic_target.features_extractor
+    of_extractor = {id(one) for one in critic.features_extractor.parameters()}
+    optimized = [{id(one) for group in net.optimizer.param_groups for one in group["params"]} for net in (actor, critic)]
+    assert not optimized[0] & of_extractor and optimized[1] >= of_extractor
+    model.learn(20)
+    copy.deepcopy(model.policy)  # what is remembered between actor and critic stays behind
+    observation, _ = ToyEnv().reset(seed=0)
+    model.save(tmp_path / "model")
+    loaded = SAC.load(tmp_path / "model", ToyEnv(), device="cpu")
+    assert np.array_equal(
+        loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+    )
+    assert loaded.actor.features_extractor is loaded.critic.features_extractor
+    loaded.learn(20)
+
+
+def test_features_that_are_remembered_are_those_that_would_be_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(updates: int) -> tuple[list[th.Tensor], int]:
+        model, passes = sharing(), 0
+        model.learn(11)
+        forward = type(model.critic.features_extractor).forward
+
+        def counted(self: Any, observations: Any) -> th.Tensor:
+            nonlocal passes
+            passes += 1
+            return forward(self, observations)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(PointNetExtractor, "forward", counted)
+            model.train(updates, batch_size=8)
+        return list(model.critic.parameters()), passes
+
+    thrifty, few = trained(1)
+    assert few == 3, "observations once, next ones by the actor and by the target"
+    assert trained(3)[1] == 9
+    monkeypatch.setattr("sb3_cpm.extractors._Remembered.recall", lambda *args: None)
+    plain, many = trained(1)
+    assert many == 5 and all(th.equal(a, b) for a, b in zip(thrifty, plain, strict=True))
+
+
+def test_a_clone_trains_the_extractor_that_is_shared() -> None:
+    model = sharing()
+    names = {id(one): name for name, one in model.policy.named_parameters()}
+    observation = {key: th.as_tensor(one).unsqueeze(0) for key, one in ToyEnv().reset(seed=0)[0].items() if key != "camera"}
+    found = {names[id(one)].split(".")[1] for one in actor_parameters(model.policy, observation)}
+    assert found == {"features_extractor", "latent_pi", "mu"}
+
+
+def test_two_ways_of_sharing_are_refused() -> None:
+    with pytest.raises(ValueError, match="two ways of sharing.*Leave one out"):
+        sharing(share_features_extractor=True)

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from torch import nn
 
 from sb3_cpm.arguments import ABOVE_0, check, check_each, choice, integer, names_checked, number
-from sb3_cpm.buffers import Demonstration
+from sb3_cpm.buffers import CPMBuffer, Demonstration
 from sb3_cpm.buffers.demonstrations import as_arrays
 from sb3_cpm.dreamer.spaces import OBSERVATION
 from sb3_cpm.imitation.callback import demonstrations_for
@@ -482,6 +482,8 @@ class CloneCallback(BaseCallback):
     that gradients are clipped to know of them. Where both share a features extractor, that belongs to the actor:
     ``policy_kwargs: {share_features_extractor: false}`` gives the value one of its own that learns from the beginning.
 
+    A :class:`~sb3_cpm.buffers.CPMBuffer` with a ``demonstration_ratio`` and no demonstrations gets the same ones.
+
     In a configuration::
 
         callback:
@@ -491,6 +493,8 @@ class CloneCallback(BaseCallback):
         that the model itself has (:class:`~sb3_cpm.imitation.DAPG`)
     :param n_episodes: how many; None: all that there are
     :param hold: whether an expert goes on to the end of the episode
+    :param after_steps: environment steps before the clone, in the first rollout that begins then: evaluations until there show
+        the model as it was
     :param critic_warmup: rounds of PPO or A2C at first that train the value alone
     :param n_updates: of :func:`clone`, as are the following
     :param batch_size: see there
@@ -512,6 +516,7 @@ class CloneCallback(BaseCallback):
         demonstrations: Source | None = "expert",
         n_episodes: int | None = 200,
         hold: bool = False,
+        after_steps: int = 0,
         critic_warmup: int = 0,
         n_updates: int = 3000,
         batch_size: int = 256,
@@ -528,10 +533,11 @@ class CloneCallback(BaseCallback):
         super().__init__(verbose)
         if n_episodes is not None:
             check("n_episodes", n_episodes, integer(1))
-        check("critic_warmup", critic_warmup, integer(0))
+        check_each(integer(0), after_steps=after_steps, critic_warmup=critic_warmup)
         self.demonstrations = demonstrations
         self.n_episodes = n_episodes
         self.hold = hold
+        self.after_steps = after_steps
         self.critic_warmup = critic_warmup
         self.seed = seed
         #: Of :func:`clone`.
@@ -543,6 +549,7 @@ class CloneCallback(BaseCallback):
         _check_arguments(n_updates, batch_size, learning_rate, loss, validation, patience)
         #: What the clone has reached; None where the model had been cloned before.
         self.result: CloneResult | None = None
+        self._episodes: list[Demonstration] = []  # that are yet to be cloned
         self._actor: list[nn.Parameter] = []
 
     def _on_training_start(self) -> None:
@@ -553,38 +560,50 @@ class CloneCallback(BaseCallback):
                 "out."
             )
         if not hasattr(model, WARMUP_LEFT):
+            self._episodes = self._find()
+            buffer = getattr(model, "replay_buffer", None)
+            if isinstance(buffer, CPMBuffer) and buffer.demonstration_ratio and buffer.demonstrations is None:
+                buffer.add_demonstrations(self._episodes)
+        if model.num_timesteps >= self.after_steps:
             self._clone()
-            setattr(model, WARMUP_LEFT, self.critic_warmup)
-        if getattr(model, WARMUP_LEFT):
-            assert isinstance(model.policy, ActorCriticPolicy)
-            self._actor = policy_gradient_parameters(model.policy)
 
-    def _clone(self) -> None:
+    def _find(self) -> list[Demonstration]:
         if self.demonstrations is None:
             if not hasattr(self.model, "demonstration_episodes"):
                 raise ValueError(
                     f"CloneCallback(demonstrations=None) takes those of the model, {type(self.model).__name__} has none: name "
                     "a source, for instance 'expert'."
                 )
-            episodes = self.model.demonstration_episodes()
-        else:
-            episodes = demonstrations_for(self.model, self.demonstrations, self.n_episodes, self.seed, self.hold)
-        self.result = clone(self.model, episodes, **self.clone_kwargs)
-        for name, value in self.result.scalars().items():
-            self.logger.record(f"clone/{name}", value)
-        if self.verbose:
-            print(_news(self.result), flush=True)  # noqa: T201
+            return self.model.demonstration_episodes()
+        return demonstrations_for(self.model, self.demonstrations, self.n_episodes, self.seed, self.hold)
+
+    def _clone(self) -> None:
+        """Once in a model's life; and what follows it."""
+        model = self.model
+        if not hasattr(model, WARMUP_LEFT):
+            self.result = clone(model, self._episodes, **self.clone_kwargs)
+            self._episodes = []
+            setattr(model, WARMUP_LEFT, self.critic_warmup)
+            for name, value in self.result.scalars().items():
+                self.logger.record(f"clone/{name}", value)
+            if self.verbose:
+                print(_news(self.result), flush=True)  # noqa: T201
+        if getattr(model, WARMUP_LEFT):
+            assert isinstance(model.policy, ActorCriticPolicy)
+            self._actor = policy_gradient_parameters(model.policy)
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        left = getattr(self.model, WARMUP_LEFT)
+        left = getattr(self.model, WARMUP_LEFT, 0)
         if left:
             setattr(self.model, WARMUP_LEFT, left - 1)
             _set_trainable(self._actor, False)  # in the update that follows
 
     def _on_rollout_start(self) -> None:
+        if self._episodes and self.num_timesteps >= self.after_steps:
+            self._clone()
         _set_trainable(self._actor, True)
 
     def _on_training_end(self) -> None:
