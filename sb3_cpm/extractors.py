@@ -34,6 +34,9 @@ class PointNet(nn.Module):
     result, and only they receive a gradient. So the maximum is searched without a gradient, and the graph is built
     for the critical points alone: the same numbers and the same gradients, for less than half of the time.
 
+    Layers begin as orthogonal matrices without a bias, as SB3's on-policy algorithms begin: points are a few centimetres from
+    each other, and PyTorch's own beginning, whose biases are larger than that, tells them apart too late (docs/imitation.md).
+
     :param n_features: columns of a point: xyz first, then anything else (colour, ...)
     :param sizes: layer sizes of the shared MLP; the last one is the size of the result
     :param input_transform: align xyz by a predicted 3x3 matrix first (the T-Net of the paper, section 4.2)
@@ -51,6 +54,10 @@ class PointNet(nn.Module):
         self.shared = nn.Sequential(*layers)
         self.last = nn.Linear(hidden[-1] if hidden else n_features, last)
         self.widest = max(sizes)
+        for layer in (*self.shared, self.last):
+            if isinstance(layer, nn.Linear):
+                nn.init.orthogonal_(layer.weight, gain=2**0.5)
+                nn.init.zeros_(layer.bias)
         self.transform = InputTransform() if input_transform else None
 
     def forward(self, points: th.Tensor) -> th.Tensor:

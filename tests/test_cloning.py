@@ -354,9 +354,11 @@ def test_a_clone_may_wait_and_the_buffer_gets_what_it_is_made_of() -> None:
                 at.append(self.num_timesteps)
             return True
 
-    callback = CloneCallback(n_episodes=3, n_updates=10, after_steps=40)
+    callback = CloneCallback(n_episodes=3, n_updates=10, after_steps=40, log_std=-2.5)
     model.learn(60, [callback, Changed()])
     assert callback.result is not None and at == list(range(41, 61))
+    state = {key: th.randn(4, *space.shape) for key, space in model.observation_space.spaces.items()}
+    assert th.equal(model.actor.get_action_dist_params(state)[1], th.full((4, 2), -2.5))
     assert len(model.replay_buffer.demonstrations.episodes) == 3
     again = CloneCallback(n_episodes=3, n_updates=10, after_steps=40)
     model.learn(20, again, reset_num_timesteps=False)
@@ -377,6 +379,10 @@ def test_of_the_toys_expert_a_clone_succeeds() -> None:
 def test_callbacks_that_cannot_work_are_refused() -> None:
     with pytest.raises(ValueError, match="critic_warmup=4 counts rounds of PPO or A2C, SAC has none"):
         make(SAC).learn(1, CloneCallback(critic_warmup=4))
+    with pytest.raises(ValueError, match="log_std=-2.5 is for SAC and TQC without gSDE; TD3 has no layer"):
+        make(TD3).learn(1, CloneCallback(log_std=-2.5))
+    with pytest.raises(ValueError, match="log_std must be a number from -20 to 2"):
+        CloneCallback(log_std=3.0)
     with pytest.raises(ValueError, match="takes those of the model, PPO has none: name a source"):
         make(PPO).learn(1, CloneCallback(demonstrations=None))
     with pytest.raises(ValueError, match="unknown key 'n_update'.*Did you mean 'n_updates'"):

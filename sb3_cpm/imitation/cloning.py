@@ -496,6 +496,9 @@ class CloneCallback(BaseCallback):
     :param after_steps: environment steps before the clone, in the first rollout that begins then: evaluations until there show
         the model as it was
     :param critic_warmup: rounds of PPO or A2C at first that train the value alone
+    :param log_std: logarithm of the standard deviation that SAC or TQC goes on with, in all states; None: what it has, about 0
+        for a new model, and so much noise erases the clone. -2.5 is where the default target entropy leads to. PPO and A2C
+        have ``policy_kwargs: {log_std_init: -2.5}``
     :param n_updates: of :func:`clone`, as are the following
     :param batch_size: see there
     :param learning_rate: see there
@@ -518,6 +521,7 @@ class CloneCallback(BaseCallback):
         hold: bool = False,
         after_steps: int = 0,
         critic_warmup: int = 0,
+        log_std: float | None = None,
         n_updates: int = 3000,
         batch_size: int = 256,
         learning_rate: float = 1e-3,
@@ -534,11 +538,14 @@ class CloneCallback(BaseCallback):
         if n_episodes is not None:
             check("n_episodes", n_episodes, integer(1))
         check_each(integer(0), after_steps=after_steps, critic_warmup=critic_warmup)
+        if log_std is not None:
+            check("log_std", log_std, number("a number from -20 to 2, as SAC's are", lambda value: -20.0 <= value <= 2.0))
         self.demonstrations = demonstrations
         self.n_episodes = n_episodes
         self.hold = hold
         self.after_steps = after_steps
         self.critic_warmup = critic_warmup
+        self.log_std = log_std
         self.seed = seed
         #: Of :func:`clone`.
         self.clone_kwargs: dict[str, Any] = {
@@ -558,6 +565,11 @@ class CloneCallback(BaseCallback):
             raise ValueError(
                 f"critic_warmup={self.critic_warmup} counts rounds of PPO or A2C, {type(model).__name__} has none: leave it "
                 "out."
+            )
+        if self.log_std is not None and not isinstance(_log_std_layer(model), nn.Linear):
+            raise ValueError(
+                f"log_std={self.log_std} is for SAC and TQC without gSDE; {type(model).__name__} has no layer that says its "
+                "standard deviation: leave it out, or for PPO and A2C give policy_kwargs=dict(log_std_init=...)."
             )
         if not hasattr(model, WARMUP_LEFT):
             self._episodes = self._find()
@@ -583,6 +595,11 @@ class CloneCallback(BaseCallback):
         if not hasattr(model, WARMUP_LEFT):
             self.result = clone(model, self._episodes, **self.clone_kwargs)
             self._episodes = []
+            if self.log_std is not None:
+                layer = _log_std_layer(model)
+                with th.no_grad():
+                    layer.weight.zero_()
+                    layer.bias.fill_(self.log_std)
             setattr(model, WARMUP_LEFT, self.critic_warmup)
             for name, value in self.result.scalars().items():
                 self.logger.record(f"clone/{name}", value)
@@ -608,6 +625,10 @@ class CloneCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         _set_trainable(self._actor, True)
+
+
+def _log_std_layer(model: BaseAlgorithm) -> Any:
+    return getattr(getattr(model.policy, "actor", None), "log_std", None)
 
 
 def _news(result: CloneResult) -> str:
