@@ -2,7 +2,7 @@
 #
 #   PYTHON=python3.11   the interpreter that .venv is made from (default: the first of 3.10 to 3.12 that is found)
 #   ENV=active          use the environment that is active instead of .venv, and install nothing
-#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`) or for pytest: a file,
+#   ARGS="..."          more arguments for `sb3_cpm train` (see `make train ARGS=--help`; --no-demonstrations) or for pytest: a file,
 #                       -m "not slow" (a third of the time), -n 0 (everything in one process)
 #   PIP_ARGS="..."      more arguments for pip, for instance where to find a CPU-only torch
 #   RENDERING=system    where no Vulkan driver is found, install one for the whole machine (needs root) instead of privately;
@@ -29,8 +29,12 @@ RUN := $(BIN)python -m
 # Threads that wait by spinning cost more than they bring at these sizes.
 export OMP_NUM_THREADS ?= 1
 
+# twenty episodes per evaluation tell 50% from 90%
+QUICK := $(if $(filter --no-demonstrations,$(ARGS)),--agent cpm_sac_quick,--agent cpm_rlpd_quick --eval-episodes 20)
+
 help:
-	@echo "make train           set up, train CPM-SAC on PickCube-v1 (shortened: agent cpm_sac_quick), leave results in runs/"
+	@echo "make train           set up, train on PickCube-v1 from scripted demonstrations until it succeeds, leave results in runs/"
+	@echo "                     (agent cpm_rlpd_quick; ARGS=--no-demonstrations: CPM-SAC without them, agent cpm_sac_quick)"
 	@echo "make pytest          set up, run all tests"
 	@echo "make sb3-tests       fetch SB3's own tests, which \`make pytest\` runs with our buffer, too, where they are"
 	@echo "                     (neither changes the system: RENDERING=system installs a Vulkan driver for the whole machine)"
@@ -39,7 +43,7 @@ help:
 	@echo "make venv, make clean-venv"
 
 train: $(READY) $(PROBED)
-	$(RUN) sb3_cpm train --agent cpm_sac_quick $(ARGS)
+	$(RUN) sb3_cpm train $(QUICK) $(filter-out --no-demonstrations,$(ARGS))
 
 # Workers share the cores; tests/conftest.py says how many: none for a single file. `-p no:xdist` takes the option away, too.
 pytest: $(READY) $(PROBED)

@@ -18,7 +18,8 @@ from sb3_cpm.extras import install_command, needed
 from sb3_cpm.run.settings import TrainSettings, field_documentation
 
 EPILOG = """examples:
-  python -m sb3_cpm train --agent cpm_sac_quick                 CPM-SAC on PickCube-v1, shortened to an hour without a GPU
+  python -m sb3_cpm train --agent cpm_rlpd_quick                PickCube-v1 from demonstrations, in minutes without a GPU
+  python -m sb3_cpm train --agent cpm_sac_quick                 CPM-SAC on PickCube-v1 without, in half an hour
   python -m sb3_cpm train --env CPMToy-v0 --steps 3000          a small task that needs no renderer
   python -m sb3_cpm train --env Pendulum-v1 --agent cpm_td3     any gymnasium task with continuous actions
   python -m sb3_cpm train --env-kwargs image_size=64 cameras=[base_camera]

@@ -86,8 +86,8 @@ def test_entries_have_only_keys_that_somebody_takes(name: str, env_id: str) -> N
 
 def test_every_file_of_the_report_has_the_seven_tasks_and_a_default() -> None:
     others = {"cpm_sac_quick", "cpm_td3", "cpm_tqc", "sac_layernorm", "sac_simba"}
-    demonstrated = {"bc_ppo", "dapg", "rlpd", "cpm_rlpd"}
-    assert len(CONFIGS) == 20
+    demonstrated = {"bc_ppo", "dapg", "rlpd", "cpm_rlpd", "cpm_rlpd_quick"}
+    assert len(CONFIGS) == 21
     for path in CONFIGS:
         if path.stem == "gail_sac":  # rewards are its own: constants for any environment would be none
             continue

@@ -18,7 +18,7 @@ from sb3_cpm.agents.tasks import ENV_IDS
 GOALLESS = ("CPM/LiftCube-v1", "CPM/TurnFaucet-v1", "CPM/OpenCabinetDoor-v1")
 ONE_DEMONSTRATION = {"sb3_cpm.imitation.DemonstrationsCallback": {"n_episodes": 1}}
 #: Record and clone 200 episodes first; tests/test_bc_ppo.py, test_dapg.py and test_gail.py have them on smaller tasks.
-CLONES = ("bc_ppo", "dapg", "gail_sac")
+CLONES = ("bc_ppo", "dapg", "gail_sac", "cpm_rlpd_quick")
 #: What makes a round short.
 SHORT: dict[str, Any] = {
     "ppo_rgbd": {"n_envs": 1, "n_steps": 3, "batch_size": 3, "n_epochs": 1},
