@@ -24,7 +24,9 @@ VISUAL = tuple(
     Task(name, f"CPM/{name}")
     for name in ("PickCube-v1", "PickSingleEGAD-v1", "PickSingleYCB-v1", "StackCube-v1", "TurnFaucet-v1")
 )
-TOY, MOUNTAINCAR, POINTMAZE = (Task(name, name) for name in ("CPMToy-v0", "MountainCarContinuous-v0", "PointMaze_UMaze-v3"))
+TOY, REACH, MOUNTAINCAR, POINTMAZE = (
+    Task(name, name) for name in ("CPMToy-v0", "CPMReach-v0", "MountainCarContinuous-v0", "PointMaze_UMaze-v3")
+)
 #: The player of the experiments with state vectors: half an update per step as in ManiSkill's example, smaller networks.
 STATE = {"sac": {"policy_kwargs": {"net_arch": [128, 128]}, "batch_size": 128, "train_freq": 2, "gradient_steps": 1}}
 #: Everything smaller, for the quick versions.
@@ -148,6 +150,42 @@ RLPD = (
     ),
 )
 BC_PPO = Contender("BC + PPO", "bc_ppo")
+
+
+def _gail(**kwargs: Any) -> dict[str, Any]:
+    """The callback of ``gail_sac.yml`` for CPMReach-v0, with changes."""
+    ours = {
+        "n_episodes": 20,
+        "discriminator_class": "vector",
+        "discriminator_kwargs": {"sizes": [64, 64]},
+        "preset": "small",
+        "reward": "logit",
+        "gradient_steps": 60,
+        "learning_rate": 1e-3,
+    }
+    return {"callback": [{"sb3_cpm.imitation.GAILCallback": {**ours, **kwargs}}]}
+
+
+#: Of the ablation of Shen et al. (2022) what a task of vectors can tell, beside a clone of the same demonstrations.
+GAIL = (
+    Contender(
+        "Clone",
+        "bc_ppo",
+        {
+            "callback": [
+                {
+                    "sb3_cpm.imitation.CloneCallback": {
+                        **{"n_episodes": 20, "hold": True, "critic_warmup": 4},
+                        **{"n_updates": 3000, "batch_size": 64},
+                    }
+                }
+            ]
+        },
+    ),
+    Contender("GAIL", "gail_sac"),
+    Contender("GAIL, self-imitation", "gail_sac", _gail(self_imitation=True)),
+    Contender("GAIL, self-imitation, one ring", "gail_sac", _gail(self_imitation=True, balance=False)),
+)
 DAPG = Contender("BC + DAPG", "dapg")
 MODES = ("pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_delta_pos", "pd_ee_target_delta_pose")
 CONTROLLERS = tuple(controller(mode) for mode in MODES)
@@ -206,6 +244,16 @@ _ALL = (
         "curves",
         Plan(CONTROLLERS[:1], 10_000, 2500, 50, 5, cost="7 to 10 CPU minutes per run"),
         Plan(CONTROLLERS[:1], 400, 200, 2, 1, cost="2 minutes on 2 cores"),
+    ),
+    Experiment(
+        "gail",
+        "",
+        "CPMReach-v0, three objects of unequal difficulty: 20 scripted episodes and no reward",
+        "not in the report; the clone is its evaluation at step 0, PPO with the reward goes on from there",
+        GAIL,
+        "curves",
+        Plan((REACH,), 10_000, 2500, 50, 5, cost="2 CPU minutes per run"),
+        Plan((REACH,), 1000, 500, 5, 1, cost="2 minutes on 2 cores"),
     ),
     Experiment(
         "pickcube-parts",
