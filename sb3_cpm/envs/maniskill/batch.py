@@ -21,6 +21,7 @@ from sb3_cpm.envs.maniskill import observations as obs_tools
 from sb3_cpm.envs.maniskill.checks import explained
 from sb3_cpm.envs.maniskill.cpu_speedups import speed_up
 from sb3_cpm.envs.maniskill.experts import Expert, make_expert, why_not
+from sb3_cpm.envs.maniskill.gains import OWN_GAINS, Gains
 from sb3_cpm.envs.maniskill.start_states import StartState, restore, state_of
 from sb3_cpm.envs.maniskill.visuals import Visuals
 from sb3_cpm.machine.thread_affinity import follow_simulation
@@ -60,6 +61,8 @@ class ManiSkillBatch:
     :param max_episode_steps: an episode is truncated after so many steps
     :param ignore_terminations: see :func:`~sb3_cpm.envs.make_maniskill_env`
     :param visuals: entered around whatever may build the scene
+    :param gains: of the arm's controller
+    :raises ValueError: for gains that the controller does not have
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class ManiSkillBatch:
         max_episode_steps: int,
         ignore_terminations: bool,
         visuals: Visuals,
+        gains: Gains = OWN_GAINS,
     ):
         self.env = env
         # the task's own name; read now, since gym.make() of an id of ours will write that id over ManiSkill's
@@ -85,6 +89,7 @@ class ManiSkillBatch:
         self.shows_goal = False
         self.goal: Any = None  # a goal view wants to know where things are, see `sb3_cpm.envs.maniskill.goals`
         self._visuals = visuals
+        self._gains = gains
         self._experts: dict[int, Expert] = {}
         self._labels = np.zeros((self.num_envs, 1), dtype=np.int16)
         self.cameras = self._choose_cameras(cameras) if obs_mode == "visual" else ()
@@ -316,6 +321,7 @@ class ManiSkillBatch:
             self._labels = clouds.label_table(things, by_role=self.cloud.labels == "roles")
         for name in set(self.env._sensors) - set(self.cameras):
             del self.env._sensors[name]
+        self._gains.give(self.env)
         speed_up(self.env)
 
 

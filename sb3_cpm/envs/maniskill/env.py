@@ -18,6 +18,7 @@ from gymnasium.utils import seeding
 from sb3_cpm.envs.maniskill.batch import OBS_MODES, ManiSkillBatch
 from sb3_cpm.envs.maniskill.checks import check_sizes, check_task, check_task_kwargs, choose_renderer, explained
 from sb3_cpm.envs.maniskill.clouds import CloudSettings
+from sb3_cpm.envs.maniskill.gains import Gains
 from sb3_cpm.envs.maniskill.simulation import choose_simulation
 from sb3_cpm.envs.maniskill.start_states import StartState, check_state
 from sb3_cpm.envs.maniskill.visuals import choose_visuals
@@ -142,6 +143,8 @@ def make_maniskill_env(
     control_mode: str = "pd_ee_delta_pose",
     reward_mode: str = "normalized_dense",
     robot_uids: str | None = None,
+    stiffness: float | None = None,
+    damping: float | None = None,
     cameras: Sequence[str] | str | None = None,
     image_size: int | tuple[int, int] = 32,
     n_points: int = 256,
@@ -178,6 +181,8 @@ def make_maniskill_env(
     :param reward_mode: ``"normalized_dense"``, ``"dense"``, ``"sparse"`` or ``"none"``, as far as the task has it
     :param robot_uids: ManiSkill's name of the robot; by default the Panda with a camera at its hand where the task knows
         the Panda, else the task's own choice
+    :param stiffness: proportional gain of the arm's PD controller, N m / rad; by default the robot's own (the Panda's: 1000)
+    :param damping: its derivative gain, N m s / rad; by default the robot's own (the Panda's: 100)
     :param cameras: names of the cameras to show; by default all of the task and of the robot
     :param image_size: pixels, one number or ``(height, width)``
     :param n_points: points of the scene; 0 leaves ``pointcloud`` out
@@ -215,6 +220,8 @@ def make_maniskill_env(
             control_mode=control_mode,
             reward_mode=reward_mode,
             robot_uids=robot_uids,
+            stiffness=stiffness,
+            damping=damping,
             cameras=cameras,
             image_size=image_size,
             n_points=n_points,
@@ -242,6 +249,8 @@ def build_batch(
     control_mode: str,
     reward_mode: str,
     robot_uids: str | None,
+    stiffness: float | None,
+    damping: float | None,
     cameras: Sequence[str] | str | None,
     image_size: int | tuple[int, int],
     n_points: int,
@@ -264,6 +273,7 @@ def build_batch(
     :param sim_backend: ``"physx_cpu"``, ``"physx_cuda"`` or ``"auto"``, see
         :func:`~sb3_cpm.envs.maniskill.simulation.choose_simulation`
     """
+    gains = Gains(stiffness, damping).check()
     height, width = check_sizes(image_size, n_points, goal_points, max_distance, max_episode_steps, render_size)
     cloud = CloudSettings(n_points, goal_points, max_distance, point_sampling, point_frame, point_labels).check()
     if obs_mode not in OBS_MODES:
@@ -302,4 +312,5 @@ def build_batch(
         max_episode_steps=task.max_episode_steps,
         ignore_terminations=ignore_terminations,
         visuals=context,
+        gains=gains,
     )
