@@ -12,8 +12,8 @@ SHELL := /bin/bash
 
 VENV := .venv
 SB3_TESTS := .sb3_tests
-EXTRAS := run,maniskill,contrib,datasets,tests,dev
-CODE := sb3_cpm tests $(wildcard benchmarks) setup.py
+EXTRAS := run,maniskill,contrib,datasets,docs,tests,dev
+CODE := sb3_cpm tests $(wildcard benchmarks) $(wildcard scripts/*.py) setup.py
 
 ifeq ($(ENV),active)
 BIN :=
@@ -38,6 +38,7 @@ help:
 	@echo "make pytest          set up, run all tests"
 	@echo "make sb3-tests       fetch SB3's own tests, which \`make pytest\` runs with our buffer, too, where they are"
 	@echo "                     (neither changes the system: RENDERING=system installs a Vulkan driver for the whole machine)"
+	@echo "make doc             the documentation as a site, in site/"
 	@echo "make doctor          what works here and what is missing"
 	@echo "make type lint format check-codestyle commit-checks"
 	@echo "make venv, make clean-venv"
@@ -57,6 +58,10 @@ sb3-tests: $(READY)
 			$(RUN) pip download --quiet --disable-pip-version-check $(PIP_ARGS) --no-deps --no-binary stable-baselines3 \
 				--dest "$(SB3_TESTS)" "stable-baselines3==$$version"; \
 		fi
+
+# into site/; a warning is an error
+doc: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --quiet
 
 doctor: $(READY)
 	$(RUN) sb3_cpm doctor
@@ -103,4 +108,4 @@ commit-checks: format type lint
 clean-venv:
 	rm -rf $(VENV)
 
-.PHONY: help train pytest sb3-tests doctor venv rendering type lint format check-codestyle commit-checks clean-venv
+.PHONY: help train pytest sb3-tests doc doctor venv rendering type lint format check-codestyle commit-checks clean-venv
