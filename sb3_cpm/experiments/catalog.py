@@ -135,6 +135,22 @@ RLPD = (
     Contender("RLPD + BC", "rlpd"),
     Contender("RLPD + BC + challenger", "cpm_rlpd"),
     Contender(
+        "RLPD + BC, from a clone",
+        "rlpd",
+        {
+            "callback": [
+                {
+                    "sb3_cpm.imitation.CloneCallback": {
+                        **{"n_episodes": 200, "log_std": -2.5},
+                        **{"n_updates": 5000, "learning_rate": 3e-3},
+                    }
+                },
+                {"sb3_cpm.imitation.BCLossCallback": {"weight": 5.0}},
+            ],
+            "learning_rate": 1e-4,
+        },
+    ),
+    Contender(
         "RLPD",
         "rlpd",
         {"callback": [{"sb3_cpm.imitation.DemonstrationsCallback": {"demonstrations": "expert", "n_episodes": 200}}]},
