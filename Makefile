@@ -105,7 +105,15 @@ check-codestyle: $(READY)
 
 commit-checks: format type lint
 
+# what a release must pass beside the tests: version and changelog agree, wheel and sdist build, an index would take them
+release-check: $(READY) check-codestyle lint type doc
+	@version="$$(cat sb3_cpm/version.txt)"; grep -q "^## Release $$version " CHANGELOG.md || \
+		{ echo "CHANGELOG.md has no section for release $$version, which sb3_cpm/version.txt names."; exit 1; }
+	rm -rf dist
+	$(RUN) build --outdir dist
+	$(RUN) twine check --strict dist/*
+
 clean-venv:
 	rm -rf $(VENV)
 
-.PHONY: help train pytest sb3-tests doc doctor venv rendering type lint format check-codestyle commit-checks clean-venv
+.PHONY: help train pytest sb3-tests doc doctor venv rendering type lint format check-codestyle commit-checks release-check clean-venv

@@ -9,12 +9,13 @@ machine where something is missing.
 import argparse
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from sb3_cpm import __version__
-from sb3_cpm.extras import install_command, needed
+from sb3_cpm.extras import config_folder, install_command, needed
 from sb3_cpm.run.settings import TrainSettings, field_documentation
 
 EPILOG = """examples:
@@ -26,6 +27,20 @@ EPILOG = """examples:
   python -m sb3_cpm train --resume runs/CPMToy-v0-cpm_sac-seed0 go on with a run that was cut off
   python -m sb3_cpm watch runs/CPMToy-v0-cpm_sac-seed0          what the world model of a run believes it will see
   python -m sb3_cpm reproduce --figure 4 --quick                an experiment of the report
+"""
+OVERVIEW = """sb3_cpm: a curious challenger beside your Stable-Baselines3 agent.
+
+  python -m sb3_cpm demo                          plain SAC and the same with a challenger, one picture, a minute or two
+  python -m sb3_cpm train --env CPMToy-v0         a small task, a folder of curves, challenges and a video (minutes)
+  python -m sb3_cpm train --agent cpm_rlpd_quick  a robot that picks up a cube, from demonstrations (minutes)
+  python -m sb3_cpm train --resume runs/FOLDER    go on with a run that was cut off
+  python -m sb3_cpm watch runs/FOLDER             what its world model expects to see, beside what happened
+  python -m sb3_cpm demonstrate --env PickCube-v1 episodes of a scripted expert in a file
+  python -m sb3_cpm reproduce --list              all experiments and figures, with their cost
+  python -m sb3_cpm doctor                        what works on this machine, and the cure for what does not
+
+Agents ({agents}): zoo_configs/.
+In your own code it is two lines: docs/quickstart.md. All options of a command: python -m sb3_cpm COMMAND --help
 """
 CHOICES = {"unit": ("step", "segment", "episode")}
 #: Of settings without a default.
@@ -41,8 +56,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Run a command.
 
     :param arguments: of the command line, without the program's name; None for those of this process
-    :return: exit status: 0 if all is well, 1 for errors that a message explains, 130 after Ctrl-C
+    :return: exit status: 0 if all is well (without arguments it shows what there is), 1 for errors that a message explains,
+        130 after Ctrl-C
     """
+    if not (sys.argv[1:] if arguments is None else arguments):
+        print(_overview())
+        return 0
     options = vars(make_parser().parse_args(arguments))
     command = options.pop("command")
     try:
@@ -62,6 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 1
+
+
+def _overview() -> str:
+    """:return: what one can do, on one screen"""
+    names = sorted(path.stem for path in config_folder().glob("*.yml"))
+    return OVERVIEW.format(agents=textwrap.fill(", ".join(names), 110, subsequent_indent="  ")).rstrip()
 
 
 def make_parser() -> argparse.ArgumentParser:

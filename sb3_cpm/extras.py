@@ -9,6 +9,7 @@ import contextlib
 import importlib.util
 import re
 from collections.abc import Iterator, Sequence
+from importlib import resources
 from pathlib import Path
 
 
@@ -107,3 +108,20 @@ def _is_installed(requirement: str) -> bool:
     except metadata.PackageNotFoundError:
         return False
     return all(_is_installed(one) for one in _requirements(name, *filter(None, extras)))
+
+
+def config_folder() -> Path:
+    """
+    A wheel brings the files as package ``sb3_cpm.zoo_configs``. A checkout has them beside the package, and they are read from
+    there: where another checkout is installed and ``PYTHONPATH`` names this one, an import would find those of the other.
+
+    :return: ``zoo_configs/``
+    :raises ValueError: where there is none
+    """
+    root = checkout()
+    if root is not None:
+        return root / "zoo_configs"
+    try:
+        return Path(str(resources.files("sb3_cpm.zoo_configs")))
+    except ModuleNotFoundError as error:
+        raise ValueError(f"sb3_cpm came without its zoo_configs: give the path of a file, or {install_command()}.") from error

@@ -23,8 +23,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_cpm import ChallengerCallback
 from sb3_cpm.agents import Agent, load_agent
 from sb3_cpm.agents.algorithms import algorithm_of
-from sb3_cpm.agents.configs import config_folder, read_entries
+from sb3_cpm.agents.configs import read_entries
 from sb3_cpm.experiments.catalog import EXPERIMENTS
+from sb3_cpm.extras import config_folder
 from sb3_cpm.run import TrainSettings, train
 from sb3_cpm.run.training import specification
 from sb3_cpm.zoo.__main__ import complete

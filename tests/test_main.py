@@ -44,12 +44,22 @@ def test_help_explains_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert __version__ in text
 
 
-@pytest.mark.parametrize("arguments", [["fly"], [], ["train", "--env-kwargs", "x"], ["train", "--env-kwargs", "x=[1"]])
+@pytest.mark.parametrize("arguments", [["fly"], ["train", "--env-kwargs", "x"], ["train", "--env-kwargs", "x=[1"]])
 def test_wrong_command_lines(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(arguments)
     assert stop.value.code == 2
     assert "error" in capsys.readouterr().err
+
+
+def test_without_arguments_it_shows_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    text = capsys.readouterr().out
+    assert len(text.splitlines()) <= 24 and max(map(len, text.splitlines())) <= 120
+    commands = cli.make_parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    shown = {line.split()[3] for line in text.splitlines() if line.startswith("  python -m sb3_cpm")}
+    assert shown <= set(commands) and {"demo", "train", "reproduce", "doctor"} <= shown
+    assert "cpm_rlpd_quick" in text and "quickstart.md" in text
 
 
 def test_errors_of_the_user_have_no_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -332,7 +332,7 @@ def test_hints_of_a_checkout_install_the_checkout(sdist: Path, tmp_path: Path) -
     assert (pip, install) == ("pip", "install") and wanted[-1] == f"{checkout}[run,zoo]"
     environment.install("--no-build-isolation", "--no-deps", *wanted)
     program = (
-        "import importlib.resources, sb3_cpm.agents.configs as configs; print(configs.config_folder())\n"
+        "import importlib.resources, sb3_cpm.extras as extras; print(extras.config_folder())\n"
         "print(importlib.resources.files('sb3_cpm.zoo_configs') / 'cpm_sac.yml')"
     )
     folder, file = environment.call("-c", program).splitlines()

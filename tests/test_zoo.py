@@ -29,11 +29,12 @@ from warm_python import WarmPython
 
 from sb3_cpm import ChallengerCallback, CPMBuffer
 from sb3_cpm.agents import load_agent
-from sb3_cpm.agents.configs import config_folder, read_entries
+from sb3_cpm.agents.configs import read_entries
 from sb3_cpm.agents.tasks import ENV_IDS, TASKS, env_id_of
 from sb3_cpm.challenger import Challenger
 from sb3_cpm.dreamer import Dreamer, Plan2Explore
 from sb3_cpm.extractors import PointNetExtractor
+from sb3_cpm.extras import config_folder
 from sb3_cpm.presets import CHALLENGES
 from sb3_cpm.zoo import search
 from sb3_cpm.zoo.__main__ import complete, main

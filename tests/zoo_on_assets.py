@@ -11,8 +11,9 @@ import pytest
 from rl_zoo3.exp_manager import ExperimentManager
 
 from sb3_cpm.agents import Agent, load_agent
-from sb3_cpm.agents.configs import config_folder, read_entries
+from sb3_cpm.agents.configs import read_entries
 from sb3_cpm.agents.tasks import ENV_IDS
+from sb3_cpm.extras import config_folder
 
 #: Tasks that are not about bringing an object to a place.
 GOALLESS = ("CPM/LiftCube-v1", "CPM/TurnFaucet-v1", "CPM/OpenCabinetDoor-v1")

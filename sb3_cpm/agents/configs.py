@@ -4,7 +4,6 @@ import copy
 import difflib
 import warnings
 from collections.abc import Iterable, Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,27 +11,10 @@ import gymnasium as gym
 
 from sb3_cpm.agents.tasks import ENV_IDS, NAMESPACE
 from sb3_cpm.arguments import nearest
-from sb3_cpm.extras import checkout, install_command, needed
+from sb3_cpm.extras import config_folder, needed
 
 with needed("Configurations", "zoo"):
     import yaml
-
-
-def config_folder() -> Path:
-    """
-    A wheel brings the files as package ``sb3_cpm.zoo_configs``. A checkout has them beside the package, and they are read from
-    there: where another checkout is installed and ``PYTHONPATH`` names this one, an import would find those of the other.
-
-    :return: ``zoo_configs/``
-    :raises ValueError: where there is none
-    """
-    root = checkout()
-    if root is not None:
-        return root / "zoo_configs"
-    try:
-        return Path(str(resources.files("sb3_cpm.zoo_configs")))
-    except ModuleNotFoundError as error:
-        raise ValueError(f"sb3_cpm came without its zoo_configs: give the path of a file, or {install_command()}.") from error
 
 
 def find_config(name_or_path: str | Path) -> Path:

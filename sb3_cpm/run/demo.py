@@ -161,7 +161,7 @@ def draw(shown: list[Shown], path: Path) -> None:
 
 
 def _draw_states(one: Shown, ax: Axes) -> "plt.cm.ScalarMappable":
-    points = ax.scatter(*one.states.T, c=np.arange(len(one.states)), s=3, cmap="viridis", linewidths=0)
+    points = ax.scatter(one.states[:, 0], one.states[:, 1], c=np.arange(len(one.states)), s=3, cmap="viridis", linewidths=0)
     ax.axvspan(GOAL, POSITIONS[1], color=ORANGE, alpha=0.25, linewidth=0)
     ax.text(GOAL + 0.01, VELOCITIES[0] * 0.98, "goal", color=ORANGE, va="bottom")
     ax.set(xlim=POSITIONS, ylim=VELOCITIES, xlabel="position")
