@@ -12,7 +12,7 @@ SHELL := /bin/bash
 
 VENV := .venv
 SB3_TESTS := .sb3_tests
-EXTRAS := run,maniskill,contrib,datasets,docs,tests,dev
+EXTRAS := run,maniskill,contrib,datasets,docs,onnx,tests,dev
 CODE := sb3_cpm tests examples $(wildcard benchmarks) $(wildcard scripts/*.py) setup.py
 
 ifeq ($(ENV),active)

@@ -1,6 +1,6 @@
 """
-The command line: ``python -m sb3_cpm COMMAND``, of demo, train, two-stage, demonstrate, watch, reproduce, doctor,
-setup-rendering and assets.
+The command line: ``python -m sb3_cpm COMMAND``, of demo, train, two-stage, demonstrate, watch, reproduce, export,
+doctor, setup-rendering and assets.
 
 Everything heavy is imported by the command that needs it, so that ``--help`` and ``doctor`` answer at once and work on a
 machine where something is missing.
@@ -197,6 +197,16 @@ def make_parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--device", default="cpu", help="PyTorch device (default: cpu)")
     reproduce.set_defaults(command=_reproduce)
 
+    export = commands.add_parser(
+        "export",
+        help="write the player of a run as an ONNX graph",
+        description="Write the way from observations to the deterministic action of a run's player as an ONNX graph, "
+        "statistics of a VecNormalize included: for robots and programs that have no PyTorch.",
+    )
+    export.add_argument("run_folder", metavar="RUN_FOLDER", help="of a run of train")
+    export.add_argument("--output", metavar="FILE", help="the .onnx file (default: player.onnx in the folder)")
+    export.set_defaults(command=_export)
+
     doctor = commands.add_parser("doctor", help="what works on this machine, and the cure for what doesn't")
     doctor.set_defaults(command=_doctor)
 
@@ -341,6 +351,15 @@ def _reproduce(figure: str | None, list: bool, **arguments: Any) -> int:
         raise RuntimeError(
             f"{error}. What is finished is kept: free the disk or choose another --results, then call it again."
         ) from error
+
+
+def _export(run_folder: str, output: str | None) -> int:
+    with needed("Runs", "run"):
+        from sb3_cpm.run.export import export_run
+    path, inputs = export_run(run_folder, output)
+    shapes = ", ".join(f"{name} {('batch', *shape)}" for name, shape in inputs.items()).replace("'", "")
+    print(f"{path}: {shapes} -> action")
+    return 0
 
 
 def _doctor() -> int:

@@ -81,7 +81,7 @@ class PointNet(nn.Module):
 
     def _parts(self, points: th.Tensor) -> Sequence[th.Tensor]:
         """Clouds that go through the layers together: on a CPU as many as its cache holds, which takes half of the time."""
-        if points.device.type != "cpu":
+        if points.device.type != "cpu" or th.compiler.is_compiling():  # a graph is for batches of any size
             return (points,)
         return points.split(max(CACHED_FLOATS // (points.shape[1] * self.widest), 1))
 

@@ -25,7 +25,7 @@ from sb3_cpm import __version__
 from sb3_cpm import checkpoint as checkpoints
 from sb3_cpm.agents import Agent, Built
 from sb3_cpm.buffers import CPMBuffer
-from sb3_cpm.files import DamagedRunError, NotFiniteError, NotWrittenError, disk_errors_named
+from sb3_cpm.files import DamagedRunError, NotFiniteError, NotWrittenError, disk_errors_named, replacing
 from sb3_cpm.run import folder as run_folder
 from sb3_cpm.run.signals import TERMINATED, sigterm_raises, undisturbed
 from sb3_cpm.run.specification import RunSpec
@@ -150,7 +150,7 @@ class Run:
         models: list[tuple[str, Callable[[], Any]]] = []
         if self.options.keep_models and begun:
             models += [("the model", self._save_model), ("the challenger", self._save_challenger)]
-            models += [("the replay buffer", self._save_replay_buffer)]
+            models += [("the replay buffer", self._save_replay_buffer), ("the normalization", self._save_normalization)]
         jobs: list[tuple[str, Callable[[], Any]]] = [("the tables", self.watcher.close), ("the logs", self._close_logs)]
         if self.options.pictures and begun:
             jobs += self._drawings()
@@ -203,6 +203,12 @@ class Run:
         buffer = getattr(self.model, "replay_buffer", None)
         if isinstance(buffer, CPMBuffer):
             buffer.save(self.folder / "replay_buffer.npz")
+
+    def _save_normalization(self) -> None:
+        normalize = self.model.get_vec_normalize_env()
+        if normalize is not None:
+            with disk_errors_named(self.folder), replacing(self.folder / run_folder.NORMALIZATION) as temporary:
+                normalize.save(str(temporary))
 
     def _film(self) -> None:
         from sb3_cpm.run.evaluation import film

@@ -35,6 +35,8 @@ if TYPE_CHECKING:  # whoever only reads results can do without
     from sb3_cpm.agents import Agent
 
 CONFIG, FINISHED, CRASHED = "config.yml", "finished.yml", "crashed.txt"
+#: Statistics of a VecNormalize, as SB3 and rl_zoo3 keep them.
+NORMALIZATION = "vecnormalize.pkl"
 PACKAGES = (
     "stable_baselines3",
     "sb3_contrib",
