@@ -29,6 +29,9 @@ class OnnxPlayer(nn.Module):
     :raises ValueError: for models that this cannot be done for
     """
 
+    low: th.Tensor
+    high: th.Tensor
+
     def __init__(self, model: BaseAlgorithm, normalize: VecNormalize | None = None) -> None:
         super().__init__()
         space, name = model.observation_space, type(model).__name__
@@ -115,4 +118,4 @@ def export_onnx(model: BaseAlgorithm, path: str | Path, normalize: VecNormalize 
         )  # fmt: skip
         assert program is not None
         program.save(str(temporary), external_data=False)
-    return {key: tuple(box.shape) for key, box in player.boxes.items()}
+    return {key: tuple(box.shape or ()) for key, box in player.boxes.items()}

@@ -2,6 +2,7 @@
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 from sb3_cpm.agents.algorithms import algorithms
 from sb3_cpm.export import export_onnx
@@ -22,7 +23,10 @@ def export_run(folder: str | Path, path: str | Path | None = None) -> tuple[Path
         if not (folder / needed).is_file():
             raise ValueError(f"{folder} holds no player that was trained: there is no {needed}. Expected the folder of a run.")
     algorithm = algorithms()[read_yaml(folder / CONFIG)["protocol"]["algo"]]
-    without_buffer = {"replay_buffer_class": None, "replay_buffer_kwargs": {}}  # which would want an environment
+    without_buffer: dict[str, Any] = {
+        "replay_buffer_class": None,
+        "replay_buffer_kwargs": {},
+    }  # which would want an environment
     model = algorithm.load(folder / "model.zip", device="cpu", custom_objects=without_buffer)
     normalize = None
     if (folder / NORMALIZATION).is_file():
