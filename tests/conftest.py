@@ -27,6 +27,7 @@ LONGEST = (
     "test_notebooks.py",
     "test_zoo.py",
     "test_tasks.py",
+    "test_gail.py",
     "test_behavior.py",
     "test_experiments.py",
     "test_callback.py",
@@ -35,6 +36,9 @@ LONGEST = (
     "test_run.py",
     "test_wheel.py",
     "test_rendering.py",
+    "test_docs.py",
+    "test_examples.py",
+    "test_cloning.py",
 )
 
 
