@@ -13,7 +13,7 @@ SHELL := /bin/bash
 VENV := .venv
 SB3_TESTS := .sb3_tests
 EXTRAS := run,maniskill,contrib,datasets,docs,onnx,tests,dev
-CODE := sb3_cpm tests examples $(wildcard benchmarks) $(wildcard scripts/*.py) setup.py
+CODE := sb3_cpm tests examples $(wildcard benchmarks) scripts setup.py
 
 ifeq ($(ENV),active)
 BIN :=
