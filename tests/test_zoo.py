@@ -122,6 +122,17 @@ def test_rlpd_with_a_challenger_differs_in_it_only() -> None:
         assert entry == {**plain[env_id], "callback": entry["callback"], "replay_buffer_kwargs": buffer}, env_id
 
 
+def test_arguments_for_one_of_several_callbacks_leave_the_others() -> None:
+    plain = load_agent("cpm_rlpd_quick", TOY).hyperparameters["callback"]
+    challenger = {"sb3_cpm.ChallengerCallback": {"decay": "cosine"}}
+    clone, bc, changed = load_agent("cpm_rlpd_quick", TOY, {"callback": challenger}).hyperparameters["callback"]
+    assert [clone, bc] == plain[:2]
+    assert changed == {"sb3_cpm.ChallengerCallback": {"demonstration_challenges": 0.25, "decay": "cosine"}}
+    without = {"callback": {"sb3_cpm.imitation.BCLossCallback": None}}
+    assert load_agent("cpm_rlpd_quick", TOY, without).hyperparameters["callback"] == [plain[0], plain[2]]
+    assert load_agent("cpm_rlpd_quick", TOY, {"callback": [challenger]}).hyperparameters["callback"] == [challenger]
+
+
 def test_tuned_differs_in_its_challenges_only() -> None:
     simple, tuned = (read_entries(config_folder() / f"{name}.yml") for name in ("cpm_sac", "cpm_sac_tuned"))
     assert set(tuned) == {*simple, ".challenges"} - {"CPMToy-v0"}

@@ -20,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cpm.agents.algorithms import algorithms, evaluated
+from sb3_cpm.agents.configs import NAMED
 from sb3_cpm.agents.tasks import NAMESPACE
 from sb3_cpm.arguments import (
     AT_LEAST_0,
@@ -95,7 +96,7 @@ def check_hyperparameters(hyperparameters: Mapping[str, Any], algo: str, env_id:
     if missing:
         raise ValueError(f"{where}: {' and '.join(sorted(missing))} must be there.")
     _check_numbers(hyperparameters, where)
-    for key in ("callback", "env_wrapper", "vec_env_wrapper"):
+    for key in NAMED:
         with error_prefix(f"{where}, {key}"):
             named = named_with_arguments(hyperparameters.get(key))
         for name, kwargs in named:

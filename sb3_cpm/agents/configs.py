@@ -103,18 +103,38 @@ def _warn_of_slip(env_id: str, entries: Iterable[str], path: Path) -> None:
         )
 
 
+#: Keys whose values are classes by name, each perhaps with arguments; or a list of such.
+NAMED = ("callback", "env_wrapper", "vec_env_wrapper")
+
+
 def merge(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param base: is not changed
-    :param overrides: dicts are merged entry by entry, everything else replaces; None removes
+    :param overrides: dicts are merged entry by entry, everything else replaces; None removes. A dict over a list of callbacks
+        or wrappers gives arguments to those that it names, and leaves the others
     :return: both
     """
     result = copy.deepcopy(dict(base))
     for key, value in overrides.items():
         if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
             result[key] = merge(result[key], value)
+        elif isinstance(value, Mapping) and isinstance(result.get(key), list) and key in NAMED:
+            result[key] = _merge_named(result[key], value)
         elif value is None:
             result.pop(key, None)
         else:
             result[key] = copy.deepcopy(value)
     return result
+
+
+def _merge_named(base: list[Any], overrides: Mapping[str, Any]) -> list[Any]:
+    """:return: the list, with arguments for those that are in it, and then those that are not"""
+    result, new = [], dict(overrides)
+    for one in base:
+        named = {one: {}} if isinstance(one, str) else one
+        changes = {name: overrides[name] for name in named if name in overrides}
+        result.append(merge(named, changes) if changes else one)
+        for name in changes:
+            new.pop(name, None)
+    result += [{name: arguments} for name, arguments in new.items() if arguments is not None]
+    return [one for one in result if one]  # an empty one was removed

@@ -169,17 +169,8 @@ BC_PPO = Contender("BC + PPO", "bc_ppo")
 
 
 def _gail(**kwargs: Any) -> dict[str, Any]:
-    """The callback of ``gail_sac.yml`` for CPMReach-v0, with changes."""
-    ours = {
-        "n_episodes": 20,
-        "discriminator_class": "vector",
-        "discriminator_kwargs": {"sizes": [64, 64]},
-        "preset": "small",
-        "reward": "logit",
-        "gradient_steps": 60,
-        "learning_rate": 1e-3,
-    }
-    return {"callback": [{"sb3_cpm.imitation.GAILCallback": {**ours, **kwargs}}]}
+    """Overrides of the arguments of ``GAILCallback``."""
+    return {"callback": {"sb3_cpm.imitation.GAILCallback": kwargs}}
 
 
 #: Of the ablation of Shen et al. (2022) what a task of vectors can tell, beside a clone of the same demonstrations.
