@@ -59,10 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :return: exit status: 0 if all is well (without arguments it shows what there is), 1 for errors that a message explains,
         130 after Ctrl-C
     """
-    if not (sys.argv[1:] if arguments is None else arguments):
-        print(_overview())
-        return 0
-    options = vars(make_parser().parse_args(arguments))
+    given = sys.argv[1:] if arguments is None else arguments
+    options = vars(make_parser().parse_args(given)) if given else {"command": _overview}
     command = options.pop("command")
     try:
         return command(**options)
@@ -83,10 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _overview() -> str:
-    """:return: what one can do, on one screen"""
+def _overview() -> int:
+    """What one can do, on one screen."""
     names = sorted(path.stem for path in config_folder().glob("*.yml"))
-    return OVERVIEW.format(agents=textwrap.fill(", ".join(names), 110, subsequent_indent="  ")).rstrip()
+    print(OVERVIEW.format(agents=textwrap.fill(", ".join(names), 110, subsequent_indent="  ")).rstrip())
+    return 0
 
 
 def make_parser() -> argparse.ArgumentParser:

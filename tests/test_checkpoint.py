@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from file_helpers import files_of_at_most
+from file_helpers import StopsAt, files_of_at_most
 from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC, TD3
@@ -51,19 +51,6 @@ def make(env: VecEnv | None = None, kind: type[BaseAlgorithm] = SAC, **kwargs: A
 
 def challenger(**kwargs: Any) -> ChallengerCallback:
     return ChallengerCallback(**{"train_freq": 10, "challenger_kwargs": SMALL, "decay_steps": 600, **kwargs})
-
-
-class StopsAt(BaseCallback):
-    """As a killed process does: without any hook of others being called."""
-
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self.step:
-            raise InterruptedError
-        return True
 
 
 def of_model(model: Any) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
+from file_helpers import StopsAt
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
@@ -414,17 +415,6 @@ def kept(callback: GAILCallback) -> list[Any]:
     return [*callback.discriminator.state_dict().values(), *moments, *(th.from_numpy(one.copy()) for one in rings)]
 
 
-class Stop(BaseCallback):
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self.step:
-            raise InterruptedError
-        return True
-
-
 @pytest.mark.parametrize("stop", [200, 350])
 def test_a_killed_run_that_goes_on_is_the_unbroken_one(stop: int, demonstrations: Any, tmp_path: Path) -> None:
     """
@@ -440,7 +430,7 @@ def test_a_killed_run_that_goes_on_is_the_unbroken_one(stop: int, demonstrations
     broken = callbacks("broken", gail(demonstrations, episodes_per_round=3))
     if stop % 100:
         with pytest.raises(InterruptedError):
-            make(reach(2)).learn(500, callback=[*broken, Stop(stop)])
+            make(reach(2)).learn(500, callback=[*broken, StopsAt(stop)])
     else:
         make(reach(2)).learn(stop, callback=broken)
     again = gail(demonstrations, episodes_per_round=3)
@@ -467,7 +457,7 @@ def test_train_goes_on_where_it_was_cut_off(tmp_path: Path) -> None:
     }
     train(run_folder=str(tmp_path / "unbroken"), **settings)
     with pytest.raises(InterruptedError):
-        train(run_folder=str(tmp_path / "broken"), callback=Stop(350), **settings)
+        train(run_folder=str(tmp_path / "broken"), callback=StopsAt(350), **settings)
     assert train(TrainSettings(resume=str(tmp_path / "broken"))).outcome == "finished"
     for table in (tmp_path / "unbroken").glob("*.csv"):
         assert table.read_bytes() == (tmp_path / "broken" / table.name).read_bytes()
